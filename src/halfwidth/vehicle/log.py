@@ -1,9 +1,10 @@
 """What a vehicle recorded: one value that every reader ends in.
 
-A log is a set of streams (position, course, speed, yaw rate, acceleration), each with its own clock. They are kept on
-one row axis, the union of all arrival times, with NaN where a stream has no new sample: nothing is interpolated, and
-two streams share a row only when they carry the same time stamp.  Units are SI; latitude and longitude are degrees of
-WGS-84, because that is what every receiver, map and track file speaks.
+A log is a set of streams (position, course, speed, yaw rate, acceleration), each with its own
+clock. They are kept on one row axis, the union of all arrival times, with NaN where a stream has no
+new sample: nothing is interpolated, and two streams share a row only when they carry the same time
+stamp. Units are SI; latitude and longitude are degrees of WGS-84, because that is what every
+receiver, map and track file speaks.
 """
 
 from collections.abc import Mapping
@@ -61,8 +62,8 @@ class Log:
     speed_mps : (N,) array
         Forward speed in metres per second; negative when driving backwards.
     yaw_rate_radps : (N,) array
-        Yaw rate in radians per second, positive when turning left (counter-clockwise seen from above), so that
-        ``d azimuth / dt = -yaw_rate``.
+        Yaw rate in radians per second, positive when turning left (counter-clockwise seen from
+        above), so that ``d azimuth / dt = -yaw_rate``.
     ax_mps2, ay_mps2 : (N,) arrays
         Acceleration, x forward and y left.
     source : str
@@ -77,12 +78,13 @@ class Log:
     BadShape
         If the streams differ in length from `t`.
     BadValue
-        If `t` is not finite and strictly increasing, a stream holds an infinity, only one of latitude and longitude is
-        there, or a position is off the Earth.
+        If `t` is not finite and strictly increasing, a stream holds an infinity, only one of
+        latitude and longitude is there, or a position is off the Earth.
 
     Notes
     -----
-    An absent stream may be left out; it is filled with NaN. All arrays are copied once and made read-only.
+    An absent stream may be left out; it is filled with NaN. All arrays are copied once and made
+    read-only.
 
     Examples
     --------
@@ -112,8 +114,9 @@ class Log:
         if t.size > 1 and not (np.diff(t) > 0).all():
             row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
             raise BadValue(
-                f"`t` goes from {t[row - 1]:.10g} s to {t[row]:.10g} s in row {row}, strictly increasing times are"
-                " expected\nhint: `halfwidth.vehicle.from_frame` sorts rows and joins those with equal times"
+                f"`t` goes from {t[row - 1]:.10g} s to {t[row]:.10g} s in row {row}, strictly"
+                " increasing times are expected\nhint: `halfwidth.vehicle.from_frame` sorts rows and"
+                " joins those with equal times"
             )
         object.__setattr__(self, "t", t)
         for name in STREAMS:
@@ -125,8 +128,8 @@ class Log:
             )
             if values.shape != t.shape:
                 raise BadShape(
-                    f"`{name}` has {values.size} rows but `t` has {t.size}, one value a row (NaN where nothing"
-                    " arrived) is expected"
+                    f"`{name}` has {values.size} rows but `t` has {t.size}, one value a row (NaN where"
+                    " nothing arrived) is expected"
                 )
             if np.isinf(values).any():
                 row = int(np.flatnonzero(np.isinf(values))[0])
@@ -142,8 +145,8 @@ class Log:
             if wrong.any():
                 row = int(np.flatnonzero(wrong)[0])
                 raise BadValue(
-                    f"`{name}` is {getattr(self, name)[row]:.10g} in row {row}, at most {limit:g} degrees either way"
-                    " are expected"
+                    f"`{name}` is {getattr(self, name)[row]:.10g} in row {row}, at most {limit:g}"
+                    " degrees either way are expected"
                 )
         object.__setattr__(self, "source", str(self.source))
         object.__setattr__(self, "notes", tuple(str(note) for note in self.notes))
@@ -159,8 +162,8 @@ class Log:
         there = ", ".join(name for name in STREAMS if np.isfinite(getattr(self, name)).any())
         length = self.t[-1] - self.t[0] if self.t.size else 0.0
         return (
-            f"Log({self.source!r}: {self.t.size} rows, {length:.1f} s, {int(self.fixed.sum())} fixes,"
-            f" streams: {there or 'none'})"
+            f"Log({self.source!r}: {self.t.size} rows, {length:.1f} s,"
+            f" {int(self.fixed.sum())} fixes, streams: {there or 'none'})"
         )
 
     @property
@@ -175,7 +178,8 @@ class Log:
         Parameters
         ----------
         name : str
-            A field name such as ``"speed_mps"``, or ``"position"`` for latitude and longitude side by side.
+            A field name such as ``"speed_mps"``, or ``"position"`` for latitude and longitude side
+            by side.
 
         Returns
         -------
@@ -214,9 +218,10 @@ class Log:
         if not t0 <= t1:
             raise BadValue(f"`t0` is {t0} s and `t1` is {t1} s, t0 <= t1 is expected")
         inside = (self.t >= t0) & (self.t <= t1)
-        return replace(
-            self, **{name: np.where(inside, np.nan, getattr(self, name)) for name in _FIX}
-        )
+        blank: dict[str, Any] = {
+            name: np.where(inside, np.nan, getattr(self, name)) for name in _FIX
+        }
+        return replace(self, **blank)
 
     def gaps(self) -> list[tuple[float, float]]:
         """List the times between consecutive fixes that are further apart than usual.
@@ -224,15 +229,15 @@ class Log:
         Returns
         -------
         list of (float, float)
-            Time of the last fix before each gap and of the first one after it, in seconds. A pause is a gap when it is
-            longer than 1.5 times the median interval between fixes. Rows before the first and after the last fix
-            are not between fixes and are not listed.
+            Time of the last fix before each gap and of the first one after it, in seconds. A pause
+            is a gap when it is longer than 1.5 times the median interval between fixes. Rows before
+            the first and after the last fix are not between fixes and are not listed.
         """
         t = self.t[self.fixed]
         if t.size < 2:
             return []
         step = np.diff(t)
-        # the slack keeps rounding of time stamps (0.1 * 3 against 0.3) from making a gap out of nothing
+        # the slack keeps rounding of time stamps (0.1 * 3 against 0.3) from making a gap
         wide = step > GAP_FACTOR * np.median(step) * (1 + 1e-9)
         return [(float(t[k]), float(t[k + 1])) for k in np.flatnonzero(wide)]
 
@@ -242,8 +247,8 @@ class Log:
         Returns
         -------
         dict of str to float or None
-            One over the median interval between arrivals, in hertz, for ``"position"`` and every stream but latitude
-            and longitude; None where fewer than two samples arrived.
+            One over the median interval between arrivals, in hertz, for ``"position"`` and every
+            stream but latitude and longitude; None where fewer than two samples arrived.
         """
         rates: dict[str, float | None] = {}
         for name in ("position", *STREAMS[2:]):
@@ -275,7 +280,7 @@ class Log:
 
 
 def to_frame(columns: Mapping[str, Any], native: str) -> Any:
-    """Make a pandas, polars or pyarrow table of named columns; optional libraries are imported here."""
+    """Make a pandas, polars or pyarrow table of named columns."""
     from importlib import import_module
 
     from halfwidth.errors import Missing
