@@ -157,32 +157,81 @@ def speed_ratio(log: Log, *, swapped: bool = False) -> Finding:
     return _finding(integral(t, np.abs(speed), found.start, found.stop) / found.distance)
 
 
-def turn_ratio(log: Log) -> Finding:
-    """Give the change of course over minus the integral of the yaw rate, where the car turns.
+@dataclass(frozen=True)
+class Turning:
+    """How the change of course follows the yaw rate.
 
-    1 where unit and sign are right, -1 where the sign is wrong, 0.01745 where the unit is deg/s.
+    Attributes
+    ----------
+    slope : float
+        Change of course over minus the integral of the yaw rate; NaN where nothing is known.
+    correlation : float
+        Of the two, over all windows.
+    n : int
+        Windows in which the car turned by at least 0.15 rad.
+    """
+
+    slope: float
+    correlation: float
+    n: int
+
+    @property
+    def enough(self) -> bool:
+        """Whether the car turned often enough, and clearly enough, to say anything."""
+        return self.n >= ENOUGH and abs(self.correlation) > 0.6
+
+
+def turning(log: Log) -> Turning:
+    """Compare changes of course with the yaw rate.
+
+    The slope is 1 where unit and sign are right, -1 where the sign is wrong, 0.01745 where the unit
+    is deg/s. Of several baselines the one with the clearest answer counts: short ones drown in the
+    fixes' error, long ones cut the corners.
     """
     t, rate = log.stream("yaw_rate_radps")
-    start, stop, turned = _turns(log)
-    return _finding(turned / -integral(t, rate, start, stop))
+    best = Turning(float("nan"), 0.0, 0)
+    if t.size < 2:
+        return best
+    for baseline in (1.0, 2.0, 4.0):
+        start, stop, turned = _turns(log, baseline)
+        expected = -integral(t, rate, start, stop)
+        known = np.isfinite(expected)
+        expected, turned = expected[known], turned[known]
+        n = int((np.abs(turned) > 0.15).sum())
+        if n < ENOUGH or not np.ptp(expected) > 0:
+            continue
+        slope, correlation = _line(expected, turned)
+        off = np.abs(turned - slope * expected)
+        calm = off <= 6 * float(np.median(off)) + 1e-12  # course of a standing car is anything
+        if int(calm.sum()) >= ENOUGH and np.ptp(expected[calm]) > 0:
+            slope, correlation = _line(expected[calm], turned[calm])
+        if abs(correlation) > abs(best.correlation):
+            best = Turning(slope, correlation, n)
+    return best
 
 
-def _turns(log: Log) -> tuple[Floats, Floats, Floats]:
-    """Find real turns: start, end, and the change of course of at least 0.2 rad in between."""
-    found = _moving(log, (1.0, 2.0, 4.0), 4.0)
-    if found is None:
-        return np.empty(0), np.empty(0), np.empty(0)
-    follower = np.searchsorted(found.start, found.stop * (1 - 1e-12))
-    first = np.flatnonzero(follower < found.start.size)
+def _line(x: Floats, y: Floats) -> tuple[float, float]:
+    """Fit y = a + slope x and give slope and correlation."""
+    dx, dy = x - x.mean(), y - y.mean()
+    sxy, sxx, syy = float(dx @ dy), float(dx @ dx), float(dy @ dy)
+    return sxy / sxx, sxy / float(np.sqrt(sxx * syy)) if syy > 0 else 0.0
+
+
+def _turns(log: Log, baseline: float) -> tuple[Floats, Floats, Floats]:
+    """Give changes of course between successive chords, from the middle of one to that of the next."""
+    found = windows(log, baseline)
+    far = found.distance >= max(3.0, 2.0 * baseline)
+    start, stop, course = found.start[far], found.stop[far], found.course[far]
+    follower = np.searchsorted(start, stop - 1e-6)
+    first = np.flatnonzero(follower < start.size)
     second = follower[first]
-    near = found.start[second] - found.stop[first] < 0.5
+    near = start[second] - stop[first] < 0.5
     first, second = first[near], second[near]
-    turned = wrapped(found.course[second] - found.course[first])
+    turned = wrapped(course[second] - course[first])
     # the chord's course is the car's course half way along it
-    start = (found.start[first] + found.stop[first]) / 2
-    stop = (found.start[second] + found.stop[second]) / 2
-    real = (np.abs(turned) > 0.2) & (np.abs(turned) < 2.5)
-    return start[real], stop[real], turned[real]
+    before, after = (start[first] + stop[first]) / 2, (start[second] + stop[second]) / 2
+    real = np.abs(turned) < 2.5
+    return before[real], after[real], turned[real]
 
 
 #: Ways to write a course, and how each becomes radians clockwise from north.

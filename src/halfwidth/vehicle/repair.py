@@ -93,7 +93,8 @@ def to_log(raw: Raw, *, repair: bool = True) -> Log:
     rows.sort()
     rows.spread_coarse_stamps()
     rows.join_equal_times()
-    log = Log(t=rows.t, **rows.streams, source=raw.source, epoch_s=epoch)
+    columns = {role: use.column for role, use in raw.uses.items()}
+    log = Log(t=rows.t, **rows.streams, source=raw.source, epoch_s=epoch, columns=columns)
     if log.t.size and epoch is not None and log.t[0] != 0:
         log = replace(log, t=log.t - log.t[0], epoch_s=epoch + float(log.t[0]))
     log = _unstated_units(log, raw, notes)
@@ -480,8 +481,8 @@ def _unstated_units(log: Log, raw: Raw, notes: list[str]) -> Log:
             log = replace(log, speed_mps=log.speed_mps * row[2])
             notes.append(f"{row[1]}, as distances between fixes say (ratio {row[0]:.3g})")
     if not _stated(raw, "yaw_rate") and np.isfinite(log.yaw_rate_radps).any():
-        found = evidence.turn_ratio(log)
-        degrees = found.enough and abs(np.log(abs(found.value) * 180 / np.pi)) < 0.5
+        found = evidence.turning(log)
+        degrees = found.enough and abs(np.log(abs(found.slope) * 180 / np.pi)) < 0.7
         blind = not found.enough and float(np.nanquantile(np.abs(log.yaw_rate_radps), 0.99)) > 3.5
         if degrees or blind:
             log = replace(log, yaw_rate_radps=np.radians(log.yaw_rate_radps))
@@ -508,7 +509,7 @@ def _contradicted(log: Log, raw: Raw, notes: list[str]) -> Log:
         turned = evidence.CONVENTIONS[convention](log.azimuth_rad)
         log = replace(log, azimuth_rad=turned % (2 * np.pi))
         notes.append(f"azimuth is in {convention}, as courses between fixes say: put right")
-    factor = contradicted_yaw(evidence.turn_ratio(log))
+    factor = contradicted_yaw(evidence.turning(log))
     if factor is not None and not _asked(raw, "yaw_rate"):
         log = replace(log, yaw_rate_radps=log.yaw_rate_radps * factor)
         words = "in deg/s" if abs(factor) < 0.5 else "in rad/s, not deg/s" if abs(factor) > 2 else ""
@@ -517,13 +518,13 @@ def _contradicted(log: Log, raw: Raw, notes: list[str]) -> Log:
     return log
 
 
-def contradicted_yaw(found: evidence.Finding) -> float | None:
+def contradicted_yaw(found: evidence.Turning) -> float | None:
     """Give the factor that makes the yaw rate fit the courses, None if it fits or nothing is sure."""
-    if not found.enough or found.value == 0 or found.spread > 0.35 * abs(found.value):
+    if not found.enough:
         return None
-    sign = 1.0 if found.value > 0 else -1.0
+    sign = 1.0 if found.slope > 0 else -1.0
     for factor in (1.0, np.pi / 180, 180 / np.pi):
-        if abs(np.log(abs(found.value) / factor)) < 0.35:
+        if abs(np.log(abs(found.slope) / factor)) < 0.7:
             return None if sign * factor == 1 else sign * factor
     return None
 
