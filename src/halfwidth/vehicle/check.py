@@ -245,13 +245,9 @@ def _rates(log: Log) -> Item:
     rates = log.rates()
     said = ", ".join(f"{_LABEL[name]} {rate:.3g} Hz" for name, rate in rates.items() if rate)
     position = rates["position"]
-    slow = [
-        name for name in ("speed_mps", "yaw_rate_radps") if (rate := rates[name]) is not None and rate < 0.5
-    ]
+    slow = [name for name in ("speed_mps", "yaw_rate_radps") if (rate := rates[name]) is not None and rate < 0.5]
     if slow:
-        return Item(
-            "rates", "warn", f"{said}; below 0.5 Hz a turn is over between two samples", rates[slow[0]], "Hz"
-        )
+        return Item("rates", "warn", f"{said}; below 0.5 Hz a turn is over between two samples", rates[slow[0]], "Hz")
     return Item("rates", "ok", said or "no stream has two samples", position, "Hz")
 
 
@@ -326,8 +322,7 @@ def _outliers(log: Log) -> Item:
     return Item(
         "outliers",
         "bad" if share > 0.05 else "warn",
-        f"{int(bad.sum())} of {bad.size} fixes jump further than a speed of {top:.0f} m/s explains,"
-        f" at {times}{more} s",
+        f"{int(bad.sum())} of {bad.size} fixes jump further than a speed of {top:.0f} m/s explains, at {times}{more} s",
         float(bad.sum()),
     )
 

@@ -6,6 +6,7 @@ with the integral of the yaw rate shows a wrong unit or sign as a factor that no
 near: 3.6, 57.3, -1. Medians over windows make single bad fixes harmless.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -235,7 +236,7 @@ def _turns(log: Log, baseline: float) -> tuple[Floats, Floats, Floats]:
 
 
 #: Ways to write a course, and how each becomes radians clockwise from north.
-CONVENTIONS = {
+CONVENTIONS: Mapping[str, Callable[[Floats], Floats]] = {
     "radians clockwise from north": lambda a: a,
     "degrees clockwise from north": np.radians,
     "radians counter-clockwise from east": lambda a: np.pi / 2 - a,

@@ -6,6 +6,7 @@ it beyond doubt, and never where the user stated it.
 """
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -94,7 +95,8 @@ def to_log(raw: Raw, *, repair: bool = True) -> Log:
     rows.spread_coarse_stamps()
     rows.join_equal_times()
     columns = {role: use.column for role, use in raw.uses.items()}
-    log = Log(t=rows.t, **rows.streams, source=raw.source, epoch_s=epoch, columns=columns)
+    given: dict[str, Any] = dict(rows.streams)
+    log = Log(t=rows.t, **given, source=raw.source, epoch_s=epoch, columns=columns)
     if log.t.size and epoch is not None and log.t[0] != 0:
         log = replace(log, t=log.t - log.t[0], epoch_s=epoch + float(log.t[0]))
     log = _unstated_units(log, raw, notes)
@@ -157,7 +159,8 @@ def _time(raw: Raw, notes: list[str]) -> tuple[Floats, float | None]:
     values = np.where(np.isinf(raw.values["time"]), np.nan, raw.values["time"])
     if not np.isfinite(values).any():
         raise BadLog(
-            f"column `{use.column}` of `{raw.source}` holds no time in any row", hint="--columns time=NAME names another"
+            f"column `{use.column}` of `{raw.source}` holds no time in any row",
+            hint="--columns time=NAME names another",
         )
     first = float(values[np.isfinite(values)][0])
     if "week" in raw.values:
@@ -284,13 +287,13 @@ def _positions(raw: Raw, streams: dict[str, Floats], notes: list[str]) -> None:
         streams[name] = np.where(drop, np.nan, streams[name])
     if both.any() and not np.isfinite(lat).any():
         raise BadLog(
-            f"`{raw.source}` has {int(both.sum())} positions and none is on Earth (latitude {notes_range(raw, 'lat')},"
-            f" longitude {notes_range(raw, 'lon')}), degrees are expected",
+            f"`{raw.source}` has {int(both.sum())} positions and none is on Earth (latitude {_range(raw, 'lat')},"
+            f" longitude {_range(raw, 'lon')}), degrees are expected",
             hint="name the columns: --columns lat=NAME,lon=NAME",
         )
 
 
-def notes_range(raw: Raw, role: str) -> str:
+def _range(raw: Raw, role: str) -> str:
     """Say from where to where a column goes."""
     held = raw.values[role][np.isfinite(raw.values[role])]
     return f"{held.min():.6g} to {held.max():.6g}"
@@ -336,7 +339,7 @@ class _Rows:
             return
         edges = np.concatenate(([0], cuts, [self.t.size]))
         # blocks of the same clock belong together: a single wild stamp does not split them
-        centre = np.array([np.median(self.t[a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+        centre = np.array([np.median(self.t[a:b]) for a, b in pairwise(edges)])
         size = np.diff(edges)
         main = centre[int(np.argmax(size))]
         near = np.abs(centre - main) <= 7 * _CLOCK_SET
@@ -380,14 +383,14 @@ class _Rows:
         for name in ("lat_deg", "speed_mps", "yaw_rate_radps", "ax_mps2"):
             held = np.isfinite(self.streams[name])
             spans = []
-            for a, b in zip(edges[:-1], edges[1:], strict=True):
+            for a, b in pairwise(edges):
                 t = self.t[a:b][held[a:b]]
                 if t.size:
                     spans.append((float(t.min()), float(t.max()), int(a)))
             spans.sort()
-            for (_, end, _a), (start, _, b) in zip(spans[:-1], spans[1:], strict=True):
+            for (_, end, one), (start, _, other) in pairwise(spans):
                 if start < end - _JITTER:
-                    row = max(_a, b)
+                    row = max(one, other)
                     raise BadLog(
                         f"`{self.source}` restarts its clock: row {row + 1} is at {self.t[row]:.6g} s after"
                         f" {self.t[row - 1]:.6g} s, and both parts hold {name} for the same times",
@@ -426,7 +429,7 @@ class _Rows:
         rows = np.arange(self.t.size)
         group = np.cumsum(new) - 1
         conflict = np.zeros(self.t.size, dtype=bool)
-        lat, lon = self.streams["lat_deg"], self.streams["lon_deg"]
+        lat = self.streams["lat_deg"]
         joined = {}
         for name, values in self.streams.items():
             held = np.isfinite(lat) if name == "lon_deg" else np.isfinite(values)
@@ -436,7 +439,6 @@ class _Rows:
             out[there] = values[first[there]]
             joined[name] = out
             conflict |= held & (values != out[group])
-        del lon
         self.notes.append(
             f"{_n(int((~new).sum()), 'row')} with the time of the row before joined to it"
             + (f", {int(conflict.sum())} of them with other values, which are dropped" if conflict.any() else "")
@@ -577,7 +579,9 @@ def _limits(log: Log, notes: list[str]) -> Log:
         beyond = np.abs(values) > most
         if beyond.any():
             k = int(np.flatnonzero(beyond)[0])
-            notes.append(f"{_n(int(beyond.sum()), 'value')} of {name} beyond {most:g} dropped (the first {values[k]:.6g})")
+            notes.append(
+                f"{_n(int(beyond.sum()), 'value')} of {name} beyond {most:g} dropped (the first {values[k]:.6g})"
+            )
             changed[name] = np.where(beyond, np.nan, values)
     azimuth = log.azimuth_rad
     wild = np.abs(azimuth) > 4 * np.pi
@@ -640,9 +644,7 @@ def _impossible(log: Log, notes: list[str]) -> Log:
         return log
     gone = np.zeros(len(log), dtype=bool)
     gone[rows[bad]] = True
-    notes.append(
-        f"{_n(int(bad.sum()), 'fix')} dropped that no car could reach (the first at {t[bad][0]:.6g} s)"
-    )
+    notes.append(f"{_n(int(bad.sum()), 'fix')} dropped that no car could reach (the first at {t[bad][0]:.6g} s)")
     changed: dict[str, Any] = {
         name: np.where(gone, np.nan, getattr(log, name)) for name in ("lat_deg", "lon_deg", "alt_m", "azimuth_rad")
     }

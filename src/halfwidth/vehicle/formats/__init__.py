@@ -29,7 +29,7 @@ def read(
     repair: bool = True,
     limits: Limits | None = None,
 ) -> Log:
-    """Read a vehicle's log.
+    r"""Read a vehicle's log.
 
     Columns are recognised by their names (``lat``, ``Latitude``, ``gps_lat_deg``, ...) and units
     from the names (``speed [km/h]``, ``gyro_z_dps``) or, where none is stated, from what the fixes

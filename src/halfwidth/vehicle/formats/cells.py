@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 #: Words that mean "nothing arrived".
-MISSING = frozenset(
-    {"", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "---", "?", "missing"}
-)
+MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "---", "?", "missing"})
 
 _HEMISPHERE = re.compile(r"^\s*([NSEWnsew])?\s*([+-]?[\d.,]+)\s*°?\s*([NSEWnsew])?\s*$")
 _TIME_OF_DAY = re.compile(r"^\s*(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d+))?\s*$")

@@ -78,9 +78,7 @@ def read_delimited(source: Source, asked: Mapping[str, str]) -> Raw:
     header = _header(first, asked, source)
     start = header.line + 1
     units: list[str] | None = None
-    n_units_line = next(
-        (k for k in range(start, min(start + 5, len(first))) if _holds_data(first[k])), None
-    )
+    n_units_line = next((k for k in range(start, min(start + 5, len(first))) if _holds_data(first[k])), None)
     if n_units_line is not None:
         cells = _split([first[n_units_line]], header.delimiter)[0]
         held = [cell for cell in cells if cell.strip().lower() not in MISSING]
@@ -195,10 +193,7 @@ class _Body:
         return Raw(
             source=name,
             uses=self.uses,
-            values={
-                role: np.concatenate(parts) if parts else np.empty(0)
-                for role, parts in self.chunks.items()
-            },
+            values={role: np.concatenate(parts) if parts else np.empty(0) for role, parts in self.chunks.items()},
             stamps=np.concatenate(self.moments) if self.moments else None,
             times=self.times,
             tallies=self.tallies,
@@ -297,9 +292,9 @@ def _header(lines: Sequence[str], asked: Mapping[str, str], source: Source) -> _
                 )
             cells = _split([bare], delimiter)[0]
             found = _Header(delimiter, index, tuple(cell.strip() for cell in cells), line)
-            if not commented and (widest is None or len(cells) > len(widest.names)):
-                if widest is None or widest.line == index:
-                    widest = found
+            first = widest is None or widest.line == index
+            if not commented and first and (widest is None or len(cells) > len(widest.names)):
+                widest = found
             score = layout.count_known(cells, asked)
             if len(cells) >= 2 and score >= 2 and (best is None or score > best[0]):
                 best = (score, found)

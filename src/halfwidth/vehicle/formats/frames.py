@@ -127,7 +127,7 @@ def read_parquet(source: Source, asked: Mapping[str, str]) -> Raw:
         # a file is mapped by name; only a pipe has to be held in memory
         file = parquet.ParquetFile(source.name if source.name != "-" else io.BytesIO(_whole(source)))
         about, schema = file.metadata, file.schema_arrow
-    except (LogTooBig, BadLog):
+    except LogTooBig:
         raise
     except Exception as error:  # whatever a damaged file makes of the decoder
         raise _damaged(source, error) from error
@@ -136,16 +136,18 @@ def read_parquet(source: Source, asked: Mapping[str, str]) -> Raw:
     names = list(schema.names)
     uses, _ = layout.recognise(names, asked, None, source.name)
     used = sorted({use.index for use in uses.values()})
+    columns = [names[k] for k in used]
     try:
-        n_bytes = _uncompressed(file, {names[k] for k in used})
-        if n_bytes > min(limits.total_bytes, limits.rows * 16 * len(used)):
-            raise _too_big(source, limits)
-        table = file.read(columns=[names[k] for k in used])
-        return read_frame(table, asked, source.name)
-    except (LogTooBig, BadLog):
-        raise
+        n_bytes = _uncompressed(file, set(columns))
     except Exception as error:
         raise _damaged(source, error) from error
+    if n_bytes > min(limits.total_bytes, limits.rows * 16 * len(used)):
+        raise _too_big(source, limits)
+    try:
+        table = file.read(columns=columns)
+    except Exception as error:
+        raise _damaged(source, error) from error
+    return read_frame(table, asked, source.name)
 
 
 def _uncompressed(file: Any, names: set[str]) -> int:

@@ -203,8 +203,7 @@ def parse_columns(text: str) -> dict[str, str]:
         role, equals, column = part.partition("=")
         if not equals or not column.strip():
             raise BadLog(
-                f"`columns` holds {part.strip()!r}, ROLE=COLUMN is expected\n"
-                "hint: lat=Breite,lon=Laenge,speed=v[km/h]"
+                f"`columns` holds {part.strip()!r}, ROLE=COLUMN is expected\nhint: lat=Breite,lon=Laenge,speed=v[km/h]"
             )
         asked[role.strip()] = column.strip()
     return asked
@@ -322,9 +321,7 @@ def recognise(
     for key, spec in asked.items():
         role = key if key in ROLES else _ROLE_OF.get(key)
         if role is None or role not in ROLES:
-            raise BadLog(
-                f"`columns` names the role {key!r}, one of {', '.join(ROLES)} is expected"
-            )
+            raise BadLog(f"`columns` names the role {key!r}, one of {', '.join(ROLES)} is expected")
         uses[role] = _use_asked(role, spec, names, source)
 
     best: dict[str, tuple[float, Use]] = {}
@@ -357,14 +354,11 @@ def recognise(
     if lacking:
         raise BadLog(unknown_layout(names, lacking, source))
     said = ", ".join(
-        f"{role} from `{_shown(use.column)}`" + (f" in {use.unit}" if use.unit else "")
-        for role, use in uses.items()
+        f"{role} from `{_shown(use.column)}`" + (f" in {use.unit}" if use.unit else "") for role, use in uses.items()
     )
     notes = [f"columns: {said}"]
     if passed:
-        notes.append(
-            f"columns passed over for a better one: {', '.join(map(_shown, passed[:8]))}"
-        )
+        notes.append(f"columns passed over for a better one: {', '.join(map(_shown, passed[:8]))}")
     return uses, notes
 
 
@@ -379,8 +373,7 @@ def _use_asked(role: str, spec: str, names: Sequence[str], source: str) -> Use:
             column, unit_text = spec.lstrip("- "), None
         else:
             raise BadLog(
-                f"`columns` names {column!r} for {role}, but `{source}` has no such column;"
-                f" found: {_listed(names)}"
+                f"`columns` names {column!r} for {role}, but `{source}` has no such column; found: {_listed(names)}"
             )
     unit = None
     if role in KIND:

@@ -10,7 +10,7 @@ import sys
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
 from halfwidth.errors import BadLog, LogTooBig
 
@@ -80,9 +80,9 @@ class Source:
         self.name = name
         self.limits = limits
         self.damage: str | None = None
-        self._stream = stream
+        self._stream: _Readable = stream
         self._n_in = self._n_out = 0
-        self._zip: "zlib._Decompress | None" = None
+        self._zip: zlib._Decompress | None = None
         self._tail = b""
         self._head = self._raw(BLOCK)
         if self._head[:2] == b"\x1f\x8b":
@@ -90,20 +90,15 @@ class Source:
             self._tail, self._head = self._head, b""
             self._head = self._inflate()
             if self._head[:2] == b"\x1f\x8b":
-                raise BadLog(
-                    f"`{name}` is compressed twice, gzip once is expected\nhint: `gunzip` it first"
-                )
+                raise BadLog(f"`{name}` is compressed twice, gzip once is expected\nhint: `gunzip` it first")
             if self._head[:4] == b"PAR1":
                 raise BadLog(
-                    f"`{name}` is a Parquet file inside gzip, Parquet alone is expected\n"
-                    "hint: `gunzip` it first"
+                    f"`{name}` is a Parquet file inside gzip, Parquet alone is expected\nhint: `gunzip` it first"
                 )
         self.kind = "parquet" if self._head[:4] == b"PAR1" else "text"
         for magic, what, way_out in _FOREIGN:
             if self._head.startswith(magic):
-                raise BadLog(
-                    f"`{name}` is {what}, CSV, gzip CSV or Parquet is expected\nhint: {way_out}"
-                )
+                raise BadLog(f"`{name}` is {what}, CSV, gzip CSV or Parquet is expected\nhint: {way_out}")
 
     @property
     def head(self) -> bytes:
@@ -175,10 +170,18 @@ class Source:
             )
 
 
+class _Readable(Protocol):
+    """What a source reads from."""
+
+    def read(self, size: int, /) -> bytes:
+        """Give up to `size` bytes, none at the end."""
+        ...
+
+
 class _Empty:
     """A stream at its end."""
 
-    def read(self, _size: int = -1) -> bytes:
+    def read(self, _size: int, /) -> bytes:
         return b""
 
 
