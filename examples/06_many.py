@@ -6,7 +6,9 @@ import halfwidth as hw
 
 
 def main():
-    trend = hw.Linear([[1, 1], [0, 1]], None, [[1, 0]], hw.Gaussian([1e-3, 1e-4]), hw.Gaussian(0.5), hw.Normal([0, 0], 9.0))
+    trend = hw.Linear(
+        [[1, 1], [0, 1]], None, [[1, 0]], hw.Gaussian([1e-3, 1e-4]), hw.Gaussian(0.5), hw.Normal([0, 0], 9.0)
+    )
     records = [hw.simulate(trend, T=500, seed=k)[1].without(100.0, 130.0) for k in range(50)]
     several = hw.estimate(trend, records)  # one estimate a record
     print(len(several), "series, total log-likelihood", round(sum(one.loglik for one in several), 1))
