@@ -194,20 +194,23 @@ def check(log: Any) -> Check:
         log = read(log, repair=False)
     elif not isinstance(log, Log):
         log = from_frame(log, repair=False)
+    swapped = _swapped(log)
+    if swapped.verdict == "bad":
+        first = "put latitude and longitude right first"
+        moving = tuple(Item(name, "not checked", first) for name in ("outliers", "speed", "azimuth", "yaw rate"))
+    else:
+        moving = (_outliers(log), _speed(log), _azimuth(log), _yaw(log))
     items = (
         _streams(log),
         _rates(log),
         _gaps(log),
         _pauses(log),
-        _swapped(log),
-        _outliers(log),
-        _speed(log),
-        _azimuth(log),
-        _yaw(log),
+        swapped,
+        *moving,
         _standstill(log),
         *_steps(log),
         _speed_scale(log),
-        _yaw_bias(log),
+        _yaw_bias(log) if moving[3].verdict != "bad" else Item("yaw bias", "not checked", "put the yaw rate right first"),
         Item("clock offset", "not checked", "the offset between fixes and sensors is not estimated yet"),
     )
     length = float(log.t[-1] - log.t[0]) if len(log) else 0.0

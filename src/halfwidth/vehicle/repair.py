@@ -30,6 +30,9 @@ _MOST = {
     "alt_m": 20_000.0,
 }
 
+#: A unit mistake makes values this much larger, at most; left alone where it is to be reported.
+_MISTAKE = 180 / np.pi
+
 #: Speed no fix-to-fix step of a car exceeds (m/s), and the distance that fix errors explain (m).
 TOP_SPEED, FIX_SLACK = 100.0, 30.0
 
@@ -102,7 +105,7 @@ def to_log(raw: Raw, *, repair: bool = True) -> Log:
     log = _unstated_units(log, raw, notes)
     if repair:
         log = _contradicted(log, raw, notes)
-    log = _limits(log, notes)
+    log = _limits(log, notes, 1.0 if repair else _MISTAKE)
     log = _held_fixes(log, notes)
     log = _impossible(log, notes)
     _enough(log, raw)
@@ -175,8 +178,8 @@ def _time(raw: Raw, notes: list[str]) -> tuple[Floats, float | None]:
     scale = FACTORS["time"][unit]
     middle = float(np.nanmedian(np.abs(values))) * scale
     if 3e8 < middle < 1e11:  # 1979 to 5138: seconds since 1970
-        # subtract first: a double holds nanoseconds since 1970 only to 256
-        return (values - first) * scale, first * scale
+        # a double holds seconds since 1970 to a quarter of a microsecond: no more is kept
+        return np.round((values - first) * scale, 6), first * scale
     return values * scale, None
 
 
@@ -571,20 +574,20 @@ def swapped_columns(log: Log) -> bool:
     return by_speed
 
 
-def _limits(log: Log, notes: list[str]) -> Log:
-    """Drop values beyond what a vehicle does: sentinels such as 9999, broken cells."""
+def _limits(log: Log, notes: list[str], room: float) -> Log:
+    """Drop values beyond `room` times what a vehicle does: sentinels such as 9999, broken cells."""
     changed: dict[str, Any] = {}
     for name, most in _MOST.items():
         values = getattr(log, name)
-        beyond = np.abs(values) > most
+        beyond = np.abs(values) > most * room
         if beyond.any():
             k = int(np.flatnonzero(beyond)[0])
             notes.append(
-                f"{_n(int(beyond.sum()), 'value')} of {name} beyond {most:g} dropped (the first {values[k]:.6g})"
+                f"{_n(int(beyond.sum()), 'value')} of {name} beyond {most * room:g} dropped (the first {values[k]:.6g})"
             )
             changed[name] = np.where(beyond, np.nan, values)
     azimuth = log.azimuth_rad
-    wild = np.abs(azimuth) > 4 * np.pi
+    wild = np.abs(azimuth) > 4 * np.pi * room
     if wild.any():
         notes.append(f"{_n(int(wild.sum()), 'value')} of azimuth_rad beyond two turns dropped")
         changed["azimuth_rad"] = np.where(wild, np.nan, azimuth)
