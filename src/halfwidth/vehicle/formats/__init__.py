@@ -7,15 +7,19 @@ never trusted: blocks are bounded, lines are bounded, decompression is bounded.
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle.formats.layout import parse_columns
 from halfwidth.vehicle.formats.source import Limits, open_source
 from halfwidth.vehicle.log import Log
 
-__all__ = ["FORMATS", "Limits", "from_frame", "read"]
+__all__ = ["FORMATS", "Limits", "from_frame", "read", "read_columns"]
 
 #: Formats by name; gzip is seen from the bytes.
 FORMATS = ("csv", "parquet")
@@ -127,3 +131,63 @@ def from_frame(
 
     asked = parse_columns(columns) if isinstance(columns, str) else dict(columns or {})
     return to_log(read_frame(frame, asked), repair=repair)
+
+
+def read_columns(
+    path: str | os.PathLike[str],
+    time: str,
+    names: Sequence[str],
+    *,
+    limits: Limits | None = None,
+) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+    """Read named columns of any table, in order of its rows, without looking at what they mean.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV, gzip CSV or Parquet; ``"-"`` is standard input.
+    time : str
+        The column of times: numbers in seconds, or dates.
+    names : sequence of str
+        Columns of numbers; a cell that holds none is NaN.
+    limits : Limits, optional
+        When to refuse a file as too big.
+
+    Returns
+    -------
+    t : (N,) array
+        Times in seconds; since the first row where the file has dates.
+    columns : dict of str to (N,) array
+
+    Raises
+    ------
+    BadLog
+        If a column is absent, or is mostly text.
+    """
+    from halfwidth.vehicle.formats import layout
+    from halfwidth.vehicle.formats.cells import seconds
+
+    source, stream = open_source(path, limits or Limits())
+    wanted = {"time": time, **{f"column {k}": name for k, name in enumerate(names)}}
+    choose = partial(layout.exactly, wanted)
+    try:
+        if source.kind == "parquet":
+            from halfwidth.vehicle.formats.frames import read_parquet
+
+            raw = read_parquet(source, wanted, choose)
+        else:
+            from halfwidth.vehicle.formats.delimited import read_delimited
+
+            raw = read_delimited(source, wanted, choose)
+    finally:
+        if stream is not sys.stdin.buffer:
+            stream.close()
+    for role, tally in raw.tallies.items():
+        if tally.n_text * 2 > tally.n_cells:
+            raise BadLog(
+                f"column `{raw.uses[role].column}` of `{source.name}` holds text in {tally.n_text} of"
+                f" {tally.n_cells} rows, the first {tally.first_text[:40]!r} in row {tally.first_row};"
+                f" {'times' if role == 'time' else 'numbers'} are expected"
+            )
+    t = raw.values["time"] if raw.stamps is None else seconds(raw.stamps)[0]
+    return t, {name: raw.values[f"column {k}"] for k, name in enumerate(names)}

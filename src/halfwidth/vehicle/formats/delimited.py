@@ -47,7 +47,9 @@ class _Header:
     text: str
 
 
-def read_delimited(source: Source, asked: Mapping[str, str]) -> Raw:
+def read_delimited(
+    source: Source, asked: Mapping[str, str], choose: layout.Chooser = layout.recognise
+) -> Raw:
     """Read the columns of a text log.
 
     Parameters
@@ -56,6 +58,8 @@ def read_delimited(source: Source, asked: Mapping[str, str]) -> Raw:
         Its bytes.
     asked : mapping of str to str
         Columns the user named, by role.
+    choose : function
+        Finds the columns among the names.
 
     Returns
     -------
@@ -84,7 +88,7 @@ def read_delimited(source: Source, asked: Mapping[str, str]) -> Raw:
         held = [cell for cell in cells if cell.strip().lower() not in MISSING]
         if held and not any(_is_number(cell) for cell in held) and any(map(layout.is_unit, held)):
             units, start = cells, n_units_line + 1
-    uses, notes = layout.recognise(header.names, asked, units, source.name)
+    uses, notes = choose(header.names, asked, units, source.name)
     body = _Body(source, header, uses)
     if header.line > 0:
         skipped = sum(_holds_data(line) for line in first[: header.line])

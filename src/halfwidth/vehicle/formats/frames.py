@@ -14,7 +14,12 @@ from halfwidth.vehicle.formats.raw import Raw
 from halfwidth.vehicle.formats.source import Limits, Source
 
 
-def read_frame(frame: Any, asked: Mapping[str, str], source: str = "frame") -> Raw:
+def read_frame(
+    frame: Any,
+    asked: Mapping[str, str],
+    source: str = "frame",
+    choose: layout.Chooser = layout.recognise,
+) -> Raw:
     """Read the columns of a pandas, polars or pyarrow table.
 
     Parameters
@@ -25,6 +30,8 @@ def read_frame(frame: Any, asked: Mapping[str, str], source: str = "frame") -> R
         Columns the user named, by role.
     source : str
         For messages.
+    choose : function
+        Finds the columns among the names.
 
     Returns
     -------
@@ -53,7 +60,7 @@ def read_frame(frame: Any, asked: Mapping[str, str], source: str = "frame") -> R
             frame = frame.reset_index(names=name)
             table = nw.from_native(frame, eager_only=True)
             names = [str(column) for column in table.columns]
-    uses, notes = layout.recognise(names, asked, None, source)
+    uses, notes = choose(names, asked, None, source)
     if len(table) == 0:
         raise BadLog(f"`{source}` has columns but no rows, at least two fixes are expected")
     raw = Raw(source, uses, {}, notes=notes)
@@ -104,7 +111,7 @@ def _nanoseconds(moments: NDArray[Any]) -> NDArray[np.int64]:
     return np.where(np.isnat(moments), NO_TIME, out)
 
 
-def read_parquet(source: Source, asked: Mapping[str, str]) -> Raw:
+def read_parquet(source: Source, asked: Mapping[str, str], choose: layout.Chooser = layout.recognise) -> Raw:
     """Read the columns of a Parquet file; only those that are used are decoded.
 
     Raises
@@ -134,7 +141,7 @@ def read_parquet(source: Source, asked: Mapping[str, str]) -> Raw:
     _within(about.num_rows, limits.rows, "rows", source)
     _within(about.num_columns, limits.columns, "columns", source)
     names = list(schema.names)
-    uses, _ = layout.recognise(names, asked, None, source.name)
+    uses, _ = choose(names, asked, None, source.name)
     used = sorted({use.index for use in uses.values()})
     columns = [names[k] for k in used]
     try:
@@ -147,7 +154,7 @@ def read_parquet(source: Source, asked: Mapping[str, str]) -> Raw:
         table = file.read(columns=columns)
     except Exception as error:
         raise _damaged(source, error) from error
-    return read_frame(table, asked, source.name)
+    return read_frame(table, asked, source.name, choose)
 
 
 def _uncompressed(file: Any, names: set[str]) -> int:

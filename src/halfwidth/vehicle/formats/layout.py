@@ -8,7 +8,7 @@ wins; a minus sign turns the sign around.
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from halfwidth.errors import BadLog
@@ -267,7 +267,7 @@ def role_of(name: str) -> tuple[str, str | None, float] | None:
 
 def count_known(names: Iterable[str], asked: Mapping[str, str]) -> int:
     """Count the roles a line of cells would fill, the three that are needed three times."""
-    wanted = {_asked(spec)[1] for spec in asked.values()}
+    wanted = {_asked(spec)[1] for spec in asked.values()} | set(asked.values())
     roles = set()
     n_asked = 0
     for name in names:
@@ -360,6 +360,22 @@ def recognise(
     if passed:
         notes.append(f"columns passed over for a better one: {', '.join(map(_shown, passed[:8]))}")
     return uses, notes
+
+
+Chooser = Callable[[Sequence[str], Mapping[str, str], Sequence[str] | None, str], tuple[dict[str, Use], list[str]]]
+
+
+def exactly(
+    wanted: Mapping[str, str], names: Sequence[str], _asked: object, _units: object, source: str
+) -> tuple[dict[str, Use], list[str]]:
+    """Find columns by their very names, for tables that are no vehicle's log."""
+    bare = [name.strip() for name in names]
+    uses = {}
+    for role, column in wanted.items():
+        if column not in bare:
+            raise BadLog(f"`{source}` has no column {column!r}; found: {_listed(names)}")
+        uses[role] = Use(role, bare.index(column), column)
+    return uses, []
 
 
 def _use_asked(role: str, spec: str, names: Sequence[str], source: str) -> Use:
