@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 from halfwidth.errors import BadRecord, BadShape, BadValue, HalfwidthError, LogTooBig, Missing, Refused, Unsolved
@@ -17,6 +18,10 @@ GOOD, INTERNAL, USAGE, BAD_INPUT, NO_ESTIMATE, LIMIT, INTERRUPTED = 0, 1, 2, 3, 
 
 #: What the system says when there is no room left.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class ReaderGone(Exception):
+    """Whoever read our output has seen enough."""
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -44,17 +49,14 @@ def run(args: Sequence[str]) -> int:
             raise
         _say("the command line needs typer, which is not installed\nhint: pip install 'halfwidth[app]'")
         return USAGE
-    try:
+    with suppress(ValueError):  # not the main thread: leave signals to whoever owns them
         # so that temporary files are cleared away when asked to stop
         signal.signal(signal.SIGTERM, _terminate)
-    except ValueError:
-        pass  # not the main thread: leave signals to whoever owns them
     try:
         code = call(list(args))
         sys.stdout.flush()
-    except BrokenPipeError:
-        # the reader has seen enough: nothing left to say, not even at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (ReaderGone, BrokenPipeError):
+        _silence()
         return GOOD
     except KeyboardInterrupt:
         _say("interrupted")
@@ -91,6 +93,8 @@ def _system(error: OSError, args: Sequence[str]) -> int:
     """Tell a full disk and an impossible path from a fault of ours."""
     where = f"`{error.filename}` " if error.filename else "the output "
     reason = (error.strerror or str(error)).lower()
+    if error.filename is None:
+        _silence()
     if error.errno in _FULL:
         _say(f"{where}cannot be written: {reason}; what was there before is still there")
         return LIMIT
@@ -116,6 +120,12 @@ def _say(words: str) -> None:
         print(words, file=sys.stderr, flush=True)
     except (OSError, ValueError):
         return
+
+
+def _silence() -> None:
+    """Let nothing more reach a standard output that takes nothing, not even at exit."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _terminate(_number: int, _frame: Any) -> None:

@@ -123,7 +123,7 @@ def fill(
     verbose: Verbose = False,
     no_progress: NoProgress = False,
 ) -> int:
-    """Fill the gaps of a vehicle's log and write the track."""  # noqa: D401 - an order to the program
+    """Fill the gaps of a vehicle's log and write the track."""
     from halfwidth.job import Job, run
     from halfwidth.vehicle.formats import read
     from halfwidth.vehicle.formats.layout import parse_columns
@@ -146,18 +146,19 @@ def fill(
               columns=parse_columns(columns or ""))  # fmt: skip
     if dry_run:
         found = read(log, columns=job.columns)
+        outputs = [path for path in (output, report) if path is not None]
         plan = {
             "schema_version": SCHEMA_VERSION,
             "command": "fill",
             "dry_run": True,
             "log": _about(found),
-            "would_write": [path for path in (output, report) if path is not None],
+            "would_write": outputs,
         }
         if json_:
             _print_json(plan)
         else:
             _words(f"would fill {found!r}", quiet)
-            for path in plan["would_write"]:
+            for path in outputs:
                 _words(f"would write {path}", quiet)
         return cli.GOOD
     started = time.perf_counter()
@@ -165,10 +166,11 @@ def fill(
         track: Any = run(job)
     command = "halfwidth " + shlex.join(_again())
     # the report first: were the track there and the report not, the run would look finished
-    if report is not None:
-        track.report(report, command=command)
-    if output is not None:
-        track.write(output)
+    with _reader():
+        if report is not None:
+            track.report(report, command=command)
+        if output is not None:
+            track.write(output)
     if json_:
         written = {"track": output, "report": report}
         _print_json(_track_json(track, written, command, time.perf_counter() - started))
@@ -206,7 +208,7 @@ def check(
     if json_:
         _print_json({"command": "check", **found.to_dict()})
     else:
-        sys.stdout.write(_printable(found.summary()))
+        _out(_printable(found.summary()))
     return cli.GOOD
 
 
@@ -252,7 +254,7 @@ def outages(
     if json_:
         _print_json({"schema_version": SCHEMA_VERSION, "command": "outages", "log": _about(found), **result.to_dict()})
     else:
-        sys.stdout.write(_printable(result.summary().rstrip("\n")) + "\n")
+        _out(_printable(result.summary().rstrip("\n")) + "\n")
     return cli.GOOD
 
 
@@ -284,7 +286,7 @@ def demo(
     if json_:
         _print_json({"schema_version": SCHEMA_VERSION, "command": "demo", **result.to_dict()})
     else:
-        sys.stdout.write(_printable(result.summary().rstrip("\n")) + "\n")
+        _out(_printable(result.summary().rstrip("\n")) + "\n")
     return cli.GOOD
 
 
@@ -336,7 +338,7 @@ def estimate(
     if output:
         from halfwidth.store import atomic_write
 
-        with atomic_write(output) as file:
+        with _reader(), atomic_write(output) as file:
             file.write(_table_bytes(table, output))
     if not quiet:
         _words(answer.summary(level), quiet)
@@ -357,7 +359,7 @@ def doctor(json_: Json = False) -> int:
     if json_:
         _print_json({"schema_version": SCHEMA_VERSION, "command": "doctor", **found})
     else:
-        sys.stdout.write(_doctor_text(found))
+        _out(_doctor_text(found))
     return cli.GOOD if found["good"] else cli.INTERNAL
 
 
@@ -365,7 +367,8 @@ def doctor(json_: Json = False) -> int:
 
 
 def _usage(words: str, hint: str) -> Exception:
-    return _UsageError(f"{words}\nhint: {hint}")
+    error: Exception = _UsageError(f"{words}\nhint: {hint}")
+    return error
 
 
 def _finite(flag: str, value: float) -> None:
@@ -430,6 +433,22 @@ def _writable(path: str | None, log: str, force: bool) -> None:
         ) from error
 
 
+def _out(text: str) -> None:
+    """Write data to standard output."""
+    with _reader():
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+
+@contextmanager
+def _reader() -> Iterator[None]:
+    """Tell the reader of our output closing it early from a failure."""
+    try:
+        yield
+    except BrokenPipeError as error:
+        raise cli.ReaderGone from error
+
+
 def _words(text: str, quiet: bool) -> None:
     if not quiet:
         print(_printable(text), file=sys.stderr)
@@ -441,8 +460,7 @@ def _printable(text: str) -> str:
 
 
 def _print_json(data: Mapping[str, Any]) -> None:
-    json.dump(_plain(data), sys.stdout, indent=2, allow_nan=False, ensure_ascii=False)
-    sys.stdout.write("\n")
+    _out(json.dumps(_plain(data), indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def _plain(value: Any) -> Any:

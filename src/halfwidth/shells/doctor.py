@@ -65,10 +65,12 @@ def _core() -> dict[str, str]:
 def _core_test() -> str:
     """Filter a random walk whose answer is known: prior 0 +- 1, noise 1 and 1, one output of 3."""
     try:
+        import numpy as np
+
         import halfwidth as hw
 
         walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(1.0), hw.Gaussian(1.0), hw.Normal([0.0], 1.0))
-        found = hw.estimate(walk, hw.Record([0.0], [3.0])).x[0, 0]
+        found = float(hw.estimate(walk, hw.Record(np.zeros(1), np.full(1, 3.0))).x[0, 0])
     except Exception as error:
         return f"failed ({type(error).__name__}: {error})"
     return "good" if abs(found - 2.0) < 1e-9 else f"wrong (2 is right, {found!r} came out)"
