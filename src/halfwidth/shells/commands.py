@@ -158,6 +158,8 @@ def fill(
             _print_json(plan)
         else:
             _words(f"would fill {found!r}", quiet)
+            for note in found.notes:
+                _words(f"note: {note}", quiet)
             for path in outputs:
                 _words(f"would write {path}", quiet)
         return cli.GOOD
