@@ -211,6 +211,11 @@ class Track:
         larger: Floats = np.maximum(self.east_half_m, self.north_half_m)
         return larger
 
+    def rows_of(self, gap: Gap) -> tuple[int, int]:
+        """Find the rows of a gap, the fixes at its ends included: first row, row after the last."""
+        first = min(int(np.searchsorted(self.t_s, gap.start)), self.t_s.size - 1)
+        return first, max(int(np.searchsorted(self.t_s, gap.stop, side="right")), first + 1)
+
     def frame(self, native: str | None = None) -> Any:
         """Give the track as a data frame.
 
