@@ -115,8 +115,8 @@ class Log:
             row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
             raise BadValue(
                 f"`t` goes from {t[row - 1]:.10g} s to {t[row]:.10g} s in row {row}, strictly"
-                " increasing times are expected\nhint: `halfwidth.vehicle.from_frame` sorts rows and"
-                " joins those with equal times"
+                " increasing times are expected\nhint: `halfwidth.vehicle.from_frame` sorts rows"
+                " and joins those with equal times"
             )
         object.__setattr__(self, "t", t)
         for name in STREAMS:
@@ -128,8 +128,8 @@ class Log:
             )
             if values.shape != t.shape:
                 raise BadShape(
-                    f"`{name}` has {values.size} rows but `t` has {t.size}, one value a row (NaN where"
-                    " nothing arrived) is expected"
+                    f"`{name}` has {values.size} rows but `t` has {t.size}, one value a row (NaN"
+                    " where nothing arrived) is expected"
                 )
             if np.isinf(values).any():
                 row = int(np.flatnonzero(np.isinf(values))[0])
