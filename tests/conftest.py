@@ -97,7 +97,9 @@ def _cases():
     steps = np.cumsum(rng.uniform(0.05, 0.4, 60))
     add("cv irregular", constant_velocity(None), t=steps, T=None)
     add("oscillator", oscillator(hw.Gaussian([0.1, 0.2, 0.1]), hw.Gaussian([0.3, 0.4]), ball), u=u, outage=(20, 30))
-    add("oscillator uniform", oscillator(hw.Uniform([0.1, 0.2, 0.1]), hw.Uniform([0.6, 0.8]), box), u=u, outage=(20, 26))
+    add(
+        "oscillator uniform", oscillator(hw.Uniform([0.1, 0.2, 0.1]), hw.Uniform([0.6, 0.8]), box), u=u, outage=(20, 26)
+    )
     add("oscillator mixed", oscillator(hw.Gaussian(0.05), hw.Uniform(0.3) + hw.Gaussian(0.1), ball), u=u)
     unknown = oscillator(hw.Uniform([0.1, 0.2, 0.1]), hw.Uniform([0.6, 0.8]), box)
     truth, record = hw.simulate(unknown, u, seed=5)

@@ -15,7 +15,9 @@ def test_coverage(method, case):
     level, runs = 0.9, 60
     hits = []
     for seed in range(runs):
-        truth, record = hw.simulate(case.model, case.record.u, T=30 if case.record.u is None else None, seed=1000 + seed)
+        truth, record = hw.simulate(
+            case.model, case.record.u, T=30 if case.record.u is None else None, seed=1000 + seed
+        )
         est = hw.estimate(case.model, holes(record, seed, 0.3), method, seed=seed)
         if est.spread is None:
             pytest.skip("a point without a spread")

@@ -35,9 +35,7 @@ def _first(noise):
     return _first(noise.uniform) + _first(noise.gaussian)
 
 
-@pytest.mark.parametrize(
-    "method", [m for m, c in PAIRS if c.name == "cv irregular" and not stochastic(m)], ids=repr
-)
+@pytest.mark.parametrize("method", [m for m, c in PAIRS if c.name == "cv irregular" and not stochastic(m)], ids=repr)
 def test_a_row_without_outputs_equals_no_row(method):
     """With matrices that follow the step, dropping the rows of a gap changes nothing at the other rows."""
     model = constant_velocity(None, w=hw.Gaussian(lambda dt: np.kron(np.eye(2), 0.5 * _wiener(dt))))

@@ -78,7 +78,7 @@ def test_arrays_are_copied():
         ({"quality": np.full(120, "good")}, BadValue, "'good', one of fix, bridged, extrap"),
         ({"quality": np.full(2, "fix")}, BadShape, r"`quality` has shape \(2,\)"),
         ({"t_s": np.zeros(120)}, BadValue, "from 0 s to 0 s in row 1"),
-        ({"level": 1.0}, BadValue, "`level` is 1.0, a probability"),
+        ({"level": 1.0}, BadValue, "`level` is 1.0, between 0"),
         ({"guarantee": "surely"}, BadValue, "`guarantee` is 'surely'"),
         ({"t_s": np.zeros(0)}, BadShape, "`t_s` is empty"),
     ],
@@ -110,12 +110,7 @@ def test_gap_at_the_start_is_extrapolated():
     quality = np.array(["extrapolated"] * 2 + ["fix"] * 2)
     gaps = gaps_of(np.arange(4.0), np.full(4, 50.0), np.full(4, 14.0), np.ones(4), quality)
     assert gaps == (Gap(0.0, 2.0, 2.0, 0.0, 1.0, "extrapolated"),)
-    assert (
-        gaps_of(
-            np.arange(4.0), np.full(4, 50.0), np.full(4, 14.0), np.ones(4), quality, at_least_s=3
-        )
-        == ()
-    )
+    assert gaps_of(np.arange(4.0), np.full(4, 50.0), np.full(4, 14.0), np.ones(4), quality, at_least_s=3) == ()
 
 
 def test_track_without_any_fix_is_one_gap():

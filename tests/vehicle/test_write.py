@@ -130,9 +130,7 @@ def test_csv_cells_are_empty_where_unknown_and_times_exact(tmp_path):
 def test_gzip_holds_the_csv(tmp_path):
     made_track().write(tmp_path / "a.csv")
     made_track().write(tmp_path / "a.csv.gz")
-    assert (
-        gzip.decompress((tmp_path / "a.csv.gz").read_bytes()) == (tmp_path / "a.csv").read_bytes()
-    )
+    assert gzip.decompress((tmp_path / "a.csv.gz").read_bytes()) == (tmp_path / "a.csv").read_bytes()
 
 
 def test_parquet_says_how_it_was_made_and_unknown_is_null(tmp_path):
@@ -308,17 +306,12 @@ def test_longitudes_stay_in_range_across_the_date_line(tmp_path, lon, name):
     content = (tmp_path / name).read_bytes()
     if name == "a.gpx":
         check_gpx(content)
-        found = [
-            p.longitude for s in gpxpy.parse(content.decode()).tracks[0].segments for p in s.points
-        ]
+        found = [p.longitude for s in gpxpy.parse(content.decode()).tracks[0].segments for p in s.points]
     elif name == "a.kml":
         found = [float(c.text.split()[0]) for c in etree.fromstring(content).iter(f"{GX}coord")]
     else:
         found = [
-            p[0]
-            for feature in json.loads(content)["features"]
-            for line in lines_of(feature["geometry"])
-            for p in line
+            p[0] for feature in json.loads(content)["features"] for line in lines_of(feature["geometry"]) for p in line
         ]
     assert min(found) >= -180
     assert max(found) <= 180

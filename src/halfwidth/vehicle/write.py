@@ -126,8 +126,8 @@ def ending(path: str, format: str | None = None) -> str:  # noqa: A002
         if path.lower().endswith(known):
             return known
     raise BadValue(
-        f"`path` is {path!r}, a name ending in one of {', '.join(endings())} is expected\n"
-        "hint: name the file track.gpx, or say `format=`"
+        f"`path` is {path!r}, a name ending in one of {', '.join(endings())} is expected",
+        hint="name the file track.gpx, or say `format=`",
     )
 
 
@@ -173,9 +173,8 @@ def absolute(track: Track, start: Start = None) -> tuple[NDArray[np.float64], st
     high = (datetime(9999, 12, 31, tzinfo=UTC) - _UNIX).total_seconds()
     if not (low <= unix[0] and unix[-1] <= high):
         raise BadValue(
-            f"`start` puts the rows {unix[0]:.0f} s to {unix[-1]:.0f} s after 1970, which no"
-            " calendar can name\nhint: say the time of `t_s = 0`, such as"
-            ' start="2024-05-01T08:00:00Z"'
+            f"`start` puts the rows {unix[0]:.0f} s to {unix[-1]:.0f} s after 1970, which no calendar can name",
+            hint='say the time of `t_s = 0`, such as start="2024-05-01T08:00:00Z"',
         )
     return unix, note
 
@@ -188,9 +187,7 @@ def _seconds(start: Start) -> float | None:
         try:
             start = datetime.fromisoformat(start)
         except ValueError as error:
-            raise BadValue(
-                f"`start` is {start!r}, a time such as 2024-05-01T08:00:00Z is expected"
-            ) from error
+            raise BadValue(f"`start` is {start!r}, a time such as 2024-05-01T08:00:00Z is expected") from error
     if isinstance(start, datetime):
         return (start if start.tzinfo else start.replace(tzinfo=UTC)).timestamp()
     if not np.isfinite(start):
@@ -252,8 +249,8 @@ def _parquet(track: Track, _: Start) -> bytes:
         import pyarrow.parquet
     except ImportError as error:
         raise Missing(
-            "a Parquet file needs pyarrow, which is not installed\nhint: pip install"
-            " 'halfwidth[formats]', or write .csv.gz"
+            "a Parquet file needs pyarrow, which is not installed",
+            hint="pip install 'halfwidth[formats]', or write .csv.gz",
         ) from error
     table = track.frame("pyarrow")
     for name in ("alt_m", "azimuth_rad", "speed_mps", "since_fix_s"):
@@ -287,10 +284,7 @@ def _title(track: Track) -> str:
 
 def _words(track: Track, note: str | None) -> str:
     """Say in a sentence what the half-widths are, and what time it is."""
-    words = (
-        f"Filled by {track.method}; half-widths at level {track.level:g}:"
-        f" {GUARANTEES[track.guarantee]}."
-    )
+    words = f"Filled by {track.method}; half-widths at level {track.level:g}: {GUARANTEES[track.guarantee]}."
     return words if note is None else f"{words} {note[0].upper()}{note[1:]}."
 
 
@@ -458,9 +452,7 @@ def _kml(track: Track, start: Start) -> bytes:
         )
         out.extend(f"<when>{when[k]}</when>\n" for k in range(first, stop))
         out.extend(f"<gx:coord>{lon[k]} {lat[k]} {alt[k]}</gx:coord>\n" for k in range(first, stop))
-        out.append(
-            '<ExtendedData><SchemaData schemaUrl="#rows"><gx:SimpleArrayData name="half_m">\n'
-        )
+        out.append('<ExtendedData><SchemaData schemaUrl="#rows"><gx:SimpleArrayData name="half_m">\n')
         out.extend(f"<gx:value>{half[k]}</gx:value>\n" for k in range(first, stop))
         out.append("</gx:SimpleArrayData></SchemaData></ExtendedData></gx:Track></Placemark>\n")
     out.append("</Folder>\n")
@@ -469,9 +461,7 @@ def _kml(track: Track, start: Start) -> bytes:
     return "".join(out).encode()
 
 
-def _kml_gaps(
-    track: Track, lat: list[str], lon: list[str], alt: list[str], when: list[str]
-) -> Iterator[str]:
+def _kml_gaps(track: Track, lat: list[str], lon: list[str], alt: list[str], when: list[str]) -> Iterator[str]:
     """Draw each gap as a line with what is known of it, for readers without ``gx:Track``."""
     if not track.gaps:
         return
