@@ -295,7 +295,7 @@ def _motion(
     speed[speed < 0.02] = 0.0
     place = np.r_[0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * _DT)]
     turned = np.r_[0.0, np.cumsum((curvature[1:] + curvature[:-1]) / 2 * _DS)]
-    azimuth: Floats = np.interp(place, along, turned) + rng.uniform(0, 2 * np.pi)
+    azimuth: Floats = np.add(np.interp(place, along, turned), rng.uniform(0, 2 * np.pi))
     middle = (azimuth[1:] + azimuth[:-1]) / 2
     moved = np.diff(place)
     lat: Floats = np.full(clock.size, np.radians(start[0]))
