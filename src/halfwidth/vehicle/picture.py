@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 #: Rows of a track that the page holds at most, and dots of measured fixes.
-MOST_ROWS, MOST_DOTS = 6000, 6000
+MOST_ROWS, MOST_DOTS = 8000, 8000
 
 #: Width over height of the map: no flatter and no steeper than these.
 _FLATTEST, _STEEPEST = 2.2, 1.5
@@ -124,7 +124,7 @@ def steps(low: float, high: float, about: int) -> Floats:
     """Choose round numbers between two values: multiples of 1, 2 or 5 times a power of ten."""
     step = round_step((high - low) / max(about, 1))
     first = np.ceil(low / step - 1e-9)
-    return np.arange(first, np.floor(high / step + 1e-9) + 1) * step
+    return np.arange(first, np.floor(high / step + 1e-9) + 1) * step + 0.0  # no negative nought
 
 
 def round_step(size: float) -> float:
@@ -271,7 +271,7 @@ def map_svg(track: Track, plane: Plane, view: View, rows: Rows, limits: Sequence
 
 def grid(view: View, plane: Plane) -> str:
     """Draw the lines of the metric grid, further than the view, as one path."""
-    step = round_step(view.width * plane.unit_m / 8) / plane.unit_m
+    step = round_step(view.width * plane.unit_m / 12) / plane.unit_m
     columns = np.arange(np.floor(view.x / step) - 2, np.ceil((view.x + view.width) / step) + 3)
     lines = np.arange(np.floor(view.y / step) - 2, np.ceil((view.y + view.height) / step) + 3)
     left, top = columns[0] * step, lines[0] * step

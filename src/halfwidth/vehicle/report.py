@@ -32,6 +32,19 @@ from halfwidth.vehicle.track import Gap, Track, runs, steps_m
 #: Rows of a table behind a chart, gaps in the table of gaps and pins on the map, at most.
 _BEHIND, _MOST_GAPS, _MOST_PINS = 60, 500, 20
 
+#: Names of the streams for readers.
+_STREAMS = {
+    "alt_m": "height",
+    "azimuth_rad": "course",
+    "speed_mps": "speed",
+    "yaw_rate_radps": "yaw rate",
+    "ax_mps2": "forward acceleration",
+    "ay_mps2": "sideways acceleration",
+}
+
+#: A dot and a dash of the legend.
+_DOT, _DASH = "M15 6h0", "M3 6h24"
+
 #: Every other mark of the time axis, which narrow screens leave out.
 _ODD = ("", " odd")
 
@@ -78,7 +91,7 @@ def verdict(track: Track) -> str:
     filled = f"{_count(count, 'gap')} filled: {_span(time)} and {_way(way)} without a fix."
     return (
         f"{filled} At worst the position is known to within {_size(worst.max_half_m)} east and"
-        f" north, in the {_span(worst.duration_s)} gap from {_time(track, worst.start)}."
+        f" north, in the {_span(worst.duration_s)} gap that starts at {_time(track, worst.start)}."
     )
 
 
@@ -308,20 +321,24 @@ def _keys(track: Track) -> str:
     fixed = int(np.count_nonzero(track.quality == "fix"))
     way = float(steps_m(track.lat_deg, track.lon_deg).sum())
     figures = [
-        ("drive", f"{_span(total)}, {_way(way)}"),
-        ("rows with a fix", f"{fixed:,} of {len(track):,}"),
-        ("gaps filled", f"{len(track.gaps):,}"),
+        ("drive", _span(total), _way(way)),
+        ("with a fix", f"{100 * fixed / len(track):.3g} %", f"{fixed:,} of {len(track):,} rows"),
+        ("gaps filled", f"{len(track.gaps):,}", f"{_span(sum(gap.duration_s for gap in track.gaps))} in all"),
     ]
     if track.gaps:
         longest = max(track.gaps, key=lambda gap: gap.duration_s)
+        worst = max(track.gaps, key=lambda gap: gap.max_half_m)
         figures += [
-            ("longest gap", f"{_span(longest.duration_s)}, {_way(longest.distance_m)}"),
-            ("worst half-width", _size(max(gap.max_half_m for gap in track.gaps))),
+            ("longest gap", _span(longest.duration_s), _way(longest.distance_m)),
+            ("worst half-width", _size(worst.max_half_m), f"gap from {_time(track, worst.start)}"),
         ]
     if fixed:
-        at_fix = float(np.median(track.half_m[track.quality == "fix"]))
-        figures.append(("half-width at fixes", _size(at_fix)))
-    items = "".join(f"<div><dt>{_t(name)}</dt><dd>{_t(value)}</dd></div>" for name, value in figures)
+        at_fix = track.half_m[track.quality == "fix"]
+        figures.append(("at fixes", _size(float(np.median(at_fix))), f"at most {_size(float(at_fix.max()))[2:]}"))
+    items = "".join(
+        f'<div><dt>{_t(name)}</dt><dd>{_t(value)} <span class="sub">{_t(more)}</span></dd></div>'
+        for name, value, more in figures
+    )
     return f'<dl class="keys">{items}</dl>\n'
 
 
@@ -362,18 +379,18 @@ def _map_section(track: Track, plane: Plane, view: View, rows: Rows, limits: Seq
     ]
     if track.gaps and not limits:
         classes = [("h5", f"filled, half-width {_size(track.gaps[0].max_half_m)[2:]}")]
-    stroke = '<svg viewBox="0 0 30 12" aria-hidden="true"><path class="{}" d="M3 6h{}"/></svg>{}'
+    stroke = '<svg viewBox="0 0 30 12" aria-hidden="true"><path class="{}" d="{}"/></svg>{}'
     items = [
-        stroke.format("fix", 0, "measured fix"),
-        stroke.format("way", 24, "track"),
-        *(stroke.format(name, 24, words) for name, words in classes if track.gaps),
+        stroke.format("fix", _DOT, "measured fix"),
+        stroke.format("way", _DASH, "track"),
+        *(stroke.format(name, _DASH, words) for name, words in classes if track.gaps),
     ]
     if any(gap.quality == "extrapolated" for gap in track.gaps):
-        items.append(stroke.format("dash", 24, "extrapolated: fixes on one side only"))
+        items.append(stroke.format("dash", _DASH, "extrapolated: fixes on one side only"))
     if track.gaps:
-        items.append(stroke.format("band", 24, "half-width across the way"))
-    items += [stroke.format("ends", 0, "start"), stroke.format("ends square", 0, "end")]
-    step = picture.round_step(view.width * plane.unit_m / 8)
+        items.append(stroke.format("band", _DASH, "half-width across the way"))
+    items += [stroke.format("ends", _DOT, "start"), stroke.format("ends square", _DOT, "end")]
+    step = picture.round_step(view.width * plane.unit_m / 12)
     tools = [("closer", "+", "Zoom in"), ("wider", "−", "Zoom out"), ("all", "Whole drive", "")]
     tools += [("previous", "‹ Gap", "Previous gap"), ("next", "Gap ›", "Next gap")]
     buttons = "".join(_tool(track, *tool) for tool in tools)
@@ -470,7 +487,7 @@ def _charts(track: Track) -> dict[str, dict[str, Any]]:
     measured = track.log.speed_mps[np.isfinite(track.log.speed_mps)]
     both = np.r_[speed, measured]
     top = _top(float(both.max()) if both.size else 1.0)
-    bottom = -_top(-float(both.min())) if both.size and both.min() < 0 else 0.0
+    bottom = -_top(-float(both.min())) if both.size and both.min() < -0.05 else 0.0
     half = _top(float(track.half_m.max()))
     return {
         "speed": {
@@ -603,7 +620,7 @@ def _ticks(track: Track) -> list[tuple[float, str]]:
     if length <= 8:
         step = picture.round_step(length / 8)
     first, last = np.ceil((t0 - zero) / step - 1e-9), np.floor((t1 - zero) / step + 1e-9)
-    values = np.arange(first, last + 1) * step
+    values = np.arange(first, last + 1) * step + 0.0  # no negative nought
     return [(100 * (v + zero - t0) / length, f"{v:.10g}") for v in values.tolist()]
 
 
@@ -698,9 +715,7 @@ def _fault_section(track: Track) -> str:
 def _streams(track: Track) -> str:
     """Name the streams of the log with their rates."""
     known = [
-        f"{name.rsplit('_', 1)[0].replace('_', ' ')} at {rate:.3g} Hz"
-        for name, rate in track.log.rates().items()
-        if rate is not None
+        f"{_STREAMS.get(name, name)} at {rate:.3g} Hz" for name, rate in track.log.rates().items() if rate is not None
     ]
     return f"{_count(len(track.log), 'row')}: {', '.join(known) or 'no stream'}."
 

@@ -28,7 +28,7 @@
   const metres = (length) => (length >= 1000 ? `${+(length / 1000).toPrecision(3)} km` : `${+length.toPrecision(3)} m`);
 
   function drawGrid() {
-    const step = round((view.w * data.unit) / 8) / data.unit;
+    const step = round((view.w * data.unit) / 12) / data.unit;
     const path = [];
     const a = Math.floor(view.x / step) - 2, b = Math.ceil((view.x + view.w) / step) + 2;
     const c = Math.floor(view.y / step) - 2, d = Math.ceil((view.y + view.h) / step) + 2;
