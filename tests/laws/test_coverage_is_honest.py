@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from tests.cases import CASES, METHODS, holes
 
 import halfwidth as hw
-from tests.conftest import CASES, METHODS, holes
 
 MODELS = [c for c in CASES if c.name in ("cv", "oscillator", "walk", "turn", "oscillator uniform", "oscillator mixed")]
 KNOWN = [(m, c) for m in METHODS for c in MODELS if m.refuses(c.model) is None]

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from tests.cases import PAIRS, stochastic
 
 import halfwidth as hw
-from tests.conftest import PAIRS, stochastic
 
 SPREAD = [
     (m, c)

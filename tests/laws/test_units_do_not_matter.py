@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tests.cases import PAIRS, stochastic
 
 import halfwidth as hw
-from tests.conftest import PAIRS, stochastic
 
 LINEAR = [(m, c) for m, c in PAIRS if isinstance(c.model, hw.Linear) and c.model.A.constant and not stochastic(m)]
 
