@@ -36,6 +36,7 @@ _HOME: dict[str, str] = {
     "BadValue": "errors",
     "BadRecord": "errors",
     "BadLog": "errors",
+    "LogTooBig": "errors",
     "Refused": "errors",
     "Missing": "errors",
     "Unsolved": "errors",
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from halfwidth.errors import BadValue as BadValue
     from halfwidth.errors import DataQualityWarning as DataQualityWarning
     from halfwidth.errors import HalfwidthError as HalfwidthError
+    from halfwidth.errors import LogTooBig as LogTooBig
     from halfwidth.errors import Missing as Missing
     from halfwidth.errors import Refused as Refused
     from halfwidth.errors import Unsolved as Unsolved
