@@ -45,6 +45,9 @@ _HOME: dict[str, str] = {
     "Recursive": "methods._protocol",
 } | {name: f"methods.{module}" for name, module in ESTIMATORS.items()}
 
+#: Packages that are part of the public names, loaded when first used as well.
+_PACKAGES = ("vehicle",)
+
 __all__ = ["__version__", *sorted(_HOME)]
 
 if TYPE_CHECKING:
@@ -78,6 +81,8 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return importlib.import_module(f"halfwidth.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'halfwidth' has no attribute {name!r}")
     value = getattr(importlib.import_module(f"halfwidth.{_HOME[name]}"), name)
