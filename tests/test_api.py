@@ -6,7 +6,7 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BadLog BadRecord BadShape BadValue Box Cloud DataQualityWarning Estimate Estimator Gaussian HalfwidthError Linear
+BadLog BadRecord BadShape BadValue Box Cloud DataQualityWarning Estimate Estimator Gaussian HalfwidthError Linear LogTooBig
 Missing Mixed Nonlinear Normal Record Recursive Refused Status Uniform Unsolved __version__ estimate from_continuous
 score simulate
 """
