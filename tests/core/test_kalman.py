@@ -213,7 +213,7 @@ def test_singular_systems_never_give_nan(isa, what, scale):
             assert got["code"][0] < 3
             low = np.linalg.eigvalsh(got["P"] / k**2)
             # a state known exactly leaves only rounding, which exact outputs then contradict
-            tol = 1e-8 if what == "Q, R" else 1e-12
+            tol = 1e-6 if what == "Q, R" else 1e-12
             assert (low[:, 0] >= -tol * np.maximum(low[:, -1], 1.0)).all()
 
 
