@@ -17,6 +17,9 @@ NAMES = [
     "Estimator",
     "Gaussian",
     "HalfwidthError",
+    "KalmanFilter",
+    "KalmanSmoother",
+    "Learned",
     "Linear",
     "Missing",
     "Mixed",
@@ -30,8 +33,12 @@ NAMES = [
     "Unsolved",
     "__version__",
     "estimate",
+    "forecast",
+    "learn",
+    "resume",
     "score",
     "simulate",
+    "stream",
 ]
 
 
