@@ -8,6 +8,8 @@ the user. NaN in y is a missing entry.
 """
 
 import importlib
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from halfwidth.methods import ESTIMATORS
@@ -31,6 +33,11 @@ _HOME: dict[str, str] = {
     "estimate": "estimate",
     "simulate": "simulate",
     "score": "score",
+    "stream": "stream",
+    "resume": "stream",
+    "forecast": "forecast",
+    "learn": "learn",
+    "Learned": "learn",
     "HalfwidthError": "errors",
     "BadShape": "errors",
     "BadValue": "errors",
@@ -63,6 +70,9 @@ if TYPE_CHECKING:
     from halfwidth.errors import Refused as Refused
     from halfwidth.errors import Unsolved as Unsolved
     from halfwidth.estimate import estimate as estimate
+    from halfwidth.forecast import forecast as forecast
+    from halfwidth.learn import Learned as Learned
+    from halfwidth.learn import learn as learn
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
     from halfwidth.model import Linear as Linear
@@ -78,6 +88,8 @@ if TYPE_CHECKING:
     from halfwidth.spread import Box as Box
     from halfwidth.spread import Cloud as Cloud
     from halfwidth.spread import Normal as Normal
+    from halfwidth.stream import resume as resume
+    from halfwidth.stream import stream as stream
 
 
 def __getattr__(name: str) -> Any:
@@ -92,3 +104,15 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return list(__all__)
+
+
+class _Front(ModuleType):
+    """Keeps a public function from being hidden by the module of the same name once that is imported."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if isinstance(value, ModuleType) and name in _HOME:
+            value = getattr(value, name)
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Front
