@@ -14,8 +14,11 @@ _HOME: dict[str, str] = {
     "Check": "check",
     "Limits": "formats",
     "Log": "log",
+    "Track": "track",
     "check": "check",
+    "fill": "fill",
     "from_frame": "formats",
+    "outages": "outage",
     "read": "formats",
 }
 
@@ -24,10 +27,13 @@ __all__ = sorted(_HOME)
 if TYPE_CHECKING:
     from halfwidth.vehicle.check import Check as Check
     from halfwidth.vehicle.check import check as check
+    from halfwidth.vehicle.fill import fill as fill
     from halfwidth.vehicle.formats import Limits as Limits
     from halfwidth.vehicle.formats import from_frame as from_frame
     from halfwidth.vehicle.formats import read as read
     from halfwidth.vehicle.log import Log as Log
+    from halfwidth.vehicle.outage import outages as outages
+    from halfwidth.vehicle.track import Track as Track
 
 
 def __getattr__(name: str) -> Any:
