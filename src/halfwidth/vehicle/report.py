@@ -26,6 +26,7 @@ import numpy as np
 from halfwidth import __version__
 from halfwidth.store import atomic_write
 from halfwidth.vehicle import picture
+from halfwidth.vehicle.check import check
 from halfwidth.vehicle.picture import CHART_HEIGHT, CHART_WIDTH, Floats, Plane, Rows, View
 from halfwidth.vehicle.track import Gap, Track, runs, steps_m
 
@@ -42,8 +43,19 @@ _STREAMS = {
     "ay_mps2": "sideways acceleration",
 }
 
+#: How the verdicts of a check look, the worst first: a sign as well as a colour.
+_VERDICTS = {
+    "bad": ("bad", "✗ bad"),
+    "warn": ("warn", "! warning"),
+    "ok": ("ok", "✓ ok"),
+    "not checked": ("none", "– not checked"),
+}
+
 #: A dot and a dash of the legend.
 _DOT, _DASH = "M15 6h0", "M3 6h24"
+
+#: Width over height of the map on narrow screens.
+_NARROW = 1.15
 
 #: Every other mark of the time axis, which narrow screens leave out.
 _ODD = ("", " odd")
@@ -241,10 +253,8 @@ def _count(number: int, word: str) -> str:
 
 
 def _size(metres: float) -> str:
-    """Write a half-width: ± with two figures or so."""
-    if metres < 10:
-        return f"± {metres:.2f} m" if metres < 1 else f"± {metres:.1f} m"
-    return f"± {metres:,.0f} m"
+    """Write a half-width: ± with two figures or so, never broken between lines."""
+    return f"±\u00a0{metres:.2f}\u00a0m" if metres < 1 else f"±\u00a0{metres:,.{1 if metres < 10 else 0}f}\u00a0m"
 
 
 def _span(seconds: float) -> str:
@@ -389,7 +399,7 @@ def _map_section(track: Track, plane: Plane, view: View, rows: Rows, limits: Seq
         items.append(stroke.format("dash", _DASH, "extrapolated: fixes on one side only"))
     if track.gaps:
         items.append(stroke.format("band", _DASH, "half-width across the way"))
-    items += [stroke.format("ends", _DOT, "start"), stroke.format("ends square", _DOT, "end")]
+    items += [stroke.format("ends", _DOT, "start"), stroke.format("ends square", "M15 6h.1", "end")]
     step = picture.round_step(view.width * plane.unit_m / 12)
     tools = [("closer", "+", "Zoom in"), ("wider", "−", "Zoom out"), ("all", "Whole drive", "")]
     tools += [("previous", "‹ Gap", "Previous gap"), ("next", "Gap ›", "Next gap")]
@@ -405,14 +415,15 @@ def _map_section(track: Track, plane: Plane, view: View, rows: Rows, limits: Seq
         f'{_length(step)}</span>.{thinned} <span class="live hide">Drag to move; click, then turn the'
         " wheel to zoom; keys: arrows, + − 0, n and p for the next and previous gap, comma and full"
         " stop to step in time.</span></p>\n"
+        f'<div class="stage"><div class="tools live hide">{buttons}</div>\n'
         '<div class="map" id="frame" tabindex="0" role="application" aria-roledescription="map"'
         f' aria-label="{_t(_map_words(track))}">\n'
         f'<svg id="map" viewBox="{view.box()}" aria-hidden="true">{drawn}'
         '<rect id="box" class="live hide"/><path id="here" class="live hide"/></svg>\n'
-        f'{pins}<div class="tools live hide">{buttons}</div>\n'
+        f"{pins}\n"
         '<div class="north" aria-hidden="true"><svg viewBox="0 0 20 26"><path d="M10 0l8 26-8-6-8 6z"/>'
         "</svg>N</div>\n"
-        f'<div class="bar" id="bar"><span id="barlength">{_length(length)}</span></div>\n</div>\n'
+        f'<div class="bar" id="bar"><span id="barlength">{_length(length)}</span></div>\n</div></div>\n'
         f'<ul class="legend">{"".join(f"<li>{item}</li>" for item in items)}</ul>\n'
         '<div class="cursor live hide"><label for="when">moment</label>'
         f'<input type="range" id="when" min="0" max="{rows.size - 1}" step="1" value="0">'
@@ -664,7 +675,7 @@ def _gap_section(track: Track, limits: Sequence[float]) -> str:
     left_out = ""
     if len(shown) > _MOST_GAPS:
         shown = sorted(sorted(shown, key=lambda g: -g.max_half_m)[:_MOST_GAPS], key=lambda g: g.start)
-        left_out = f" The {_MOST_GAPS} known worst of {len(track.gaps):,} are listed."
+        left_out = f'<p class="about">The {_MOST_GAPS} known worst of {len(track.gaps):,} are listed.</p>'
     numbers = {id(gap): k for k, gap in enumerate(track.gaps)}
     body = []
     for gap in shown:
@@ -696,20 +707,30 @@ def _gap_cells_numbered(track: Track, gap: Gap, number: int) -> list[str]:
 
 def _fault_section(track: Track) -> str:
     """Say what is wrong with the log, and what its reader did about it."""
-    faults = _faults(track)
+    found = sorted(check(track.log).items, key=lambda item: list(_VERDICTS).index(item.verdict))
+    faults = sum(item.verdict in ("bad", "warn") for item in found)
+    body = [
+        [
+            '<span class="{}">{}</span>'.format(*_VERDICTS[item.verdict]),
+            _t(item.name.replace("_", " ")),
+            _t(item.sentence),
+            f"<code>{_t(item.line)}</code>" if item.line else "",
+        ]
+        for item in found
+    ]
+    head = (
+        ["verdict", "looked at", "found", "to type"]
+        if any(row[3] for row in body)
+        else ["verdict", "looked at", "found"]
+    )
+    table = _table(head, [row[: len(head)] for row in body], words=range(4))
     notes = "".join(f"<li>{_t(note)}</li>" for note in track.log.notes)
-    parts = ["<section>\n<h2>The log</h2>\n"]
-    parts.append(f'<p class="about">{_t(_streams(track))}</p>')
-    if faults is not None:
-        rows = _records(faults)
-        if rows:
-            parts.append(_record_table(rows))
-        else:
-            parts.append('<p><span class="ok">Nothing wrong was found.</span></p>')
-    if notes:
-        parts.append(f"<p>While reading:</p><ul>{notes}</ul>")
-    parts.append("</section>\n")
-    return "".join(parts)
+    told = f"{_count(faults, 'fault')} found." if faults else "No fault found."
+    return (
+        f'<section>\n<h2>The log</h2>\n<p class="about">{_t(_streams(track))} <strong>{told}</strong></p>{table}'
+        + (f"<h3>While reading</h3><ul>{notes}</ul>" if notes else "")
+        + "</section>\n"
+    )
 
 
 def _streams(track: Track) -> str:
@@ -718,11 +739,6 @@ def _streams(track: Track) -> str:
         f"{_STREAMS.get(name, name)} at {rate:.3g} Hz" for name, rate in track.log.rates().items() if rate is not None
     ]
     return f"{_count(len(track.log), 'row')}: {', '.join(known) or 'no stream'}."
-
-
-def _faults(track: Track) -> Any:
-    """Ask `check` what is wrong with the log."""
-    return None
 
 
 def _benchmark_section(track: Track) -> str:
@@ -785,9 +801,11 @@ def _settings_section(track: Track, command: str | None) -> str:
     settings = {"method": track.method, "level": track.level, **track.settings}
     body = [[_t(name.replace("_", " ")), _t(_cell(value))] for name, value in settings.items()]
     again = command if command is not None else _command(track)
+    # an option is not to be broken at its hyphens
+    parts = [f'<span class="nb">{_t(word)}</span>' if word.startswith("-") else _t(word) for word in again.split(" ")]
     return (
         "<section>\n<h2>Make it again</h2>\n"
-        f"<pre><code>{_t(again)}</code></pre>\n"
+        f"<pre><code>{' '.join(parts)}</code></pre>\n"
         f"{_table(['setting', 'value'], body, words=[0, 1])}</section>\n"
     )
 
@@ -805,17 +823,20 @@ def _command(track: Track) -> str:
 def _placing(track: Track, plane: Plane, view: View, charts: Mapping[str, Mapping[str, Any]]) -> str:
     """Write the rules that depend on the track: a strict policy allows no style attributes."""
     rules = [f".map{{aspect-ratio:{view.width / view.height:.4f}}}"]
+    narrow = [f".map{{aspect-ratio:{_NARROW}}}"]
     rules.append(f".bar{{width:{picture.scale_bar(view, plane)[1]:.3f}%}}")
     for number, (x, y) in _pin_places(track, plane).items():
         left, top = view.percent(x, y)
         rules.append(f".p{number}{{left:{left:.2f}%;top:{top:.2f}%}}")
+        lower = 50 + (top - 50) * _NARROW * view.height / view.width
+        narrow.append(f".p{number}{{top:{lower:.2f}%}}")
     for name, chart in charts.items():
         size = chart["high"] - chart["low"]
         for k, (value, _) in enumerate(chart["marks"]):
             rules.append(f".{name}{k}{{bottom:{100 * (value - chart['low']) / size:.2f}%}}")
     for k, (percent, _) in enumerate(_ticks(track)):
         rules.append(f".x{k}{{left:{percent:.2f}%}}")
-    return "".join(rules)
+    return "".join(rules) + f"@media (max-width:620px){{{''.join(narrow)}}}"
 
 
 def _data(

@@ -15,8 +15,8 @@
   for (const [kind, count] of data.q) for (let k = 0; k < count; k++) quality.push(kind);
   const last = t.length - 1;
   const map = $("map"), frame = $("frame"), slider = $("when"), readout = $("now");
-  const whole = { x: data.view[0], y: data.view[1], w: data.view[2], h: data.view[3] };
-  let view = { ...whole };
+  const drawn = { x: data.view[0], y: data.view[1], w: data.view[2], h: data.view[3] };
+  let whole = drawn, view = drawn;
   let span = [t[0], t[last]];
   let current = 0;
 
@@ -51,6 +51,16 @@
       pin.style.top = `${top}%`;
       pin.classList.toggle("hide", left < 0 || left > 100 || top < 0 || top > 100);
     }
+  }
+
+  // the whole drive in whatever shape the map has on this screen
+  function fit() {
+    const box = map.getBoundingClientRect();
+    if (!box.width || !box.height) return;
+    const w = Math.max(drawn.w, (drawn.h * box.width) / box.height), h = (w * box.height) / box.width;
+    const same = view === whole;
+    whole = { x: drawn.x + (drawn.w - w) / 2, y: drawn.y + (drawn.h - h) / 2, w, h };
+    if (same) { view = whole; drawMap(); } else look(view);
   }
 
   function look(next) {
@@ -91,7 +101,8 @@
   let shown = -1;
 
   function showAll() {
-    look(whole);
+    view = whole;
+    drawMap();
     drawCharts(t[0], t[last]);
     shown = -1;
   }
@@ -292,5 +303,7 @@
   for (const live of document.querySelectorAll(".live")) live.classList.remove("hide");
   point(data.worst);
   drawMap();
+  fit();
+  new ResizeObserver(fit).observe(map);
   document.documentElement.dataset.ready = "yes";
 })();
