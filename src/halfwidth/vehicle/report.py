@@ -26,22 +26,12 @@ import numpy as np
 from halfwidth import __version__
 from halfwidth.store import atomic_write
 from halfwidth.vehicle import picture
-from halfwidth.vehicle.check import check
+from halfwidth.vehicle.check import Item, check
 from halfwidth.vehicle.picture import CHART_HEIGHT, CHART_WIDTH, Floats, Plane, Rows, View
 from halfwidth.vehicle.track import Gap, Track, runs, steps_m
 
 #: Rows of a table behind a chart, gaps in the table of gaps and pins on the map, at most.
 _BEHIND, _MOST_GAPS, _MOST_PINS = 60, 500, 20
-
-#: Names of the streams for readers.
-_STREAMS = {
-    "alt_m": "height",
-    "azimuth_rad": "course",
-    "speed_mps": "speed",
-    "yaw_rate_radps": "yaw rate",
-    "ax_mps2": "forward acceleration",
-    "ay_mps2": "sideways acceleration",
-}
 
 #: How the verdicts of a check look, the worst first: a sign as well as a colour.
 _VERDICTS = {
@@ -109,7 +99,7 @@ def verdict(track: Track) -> str:
 
 def kind_of_bound(track: Track) -> str:
     """Say what kind of bound the half-widths are, and what the log itself says about that."""
-    share = f"{100 * track.level:g} %"
+    share = f"{100 * track.level:g}\u00a0%"
     words = {
         "proven": (
             "proven bound",
@@ -260,14 +250,14 @@ def _size(metres: float) -> str:
 def _span(seconds: float) -> str:
     """Write a length of time."""
     if seconds < 100:
-        return f"{seconds:.1f} s".replace(".0 s", " s")
+        return f"{seconds:.1f}\u00a0s".replace(".0\u00a0", "\u00a0")
     minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes:,} min {rest} s" if minutes else f"{rest} s"
+    return f"{minutes:,}\u00a0min" + (f" {rest}\u00a0s" if rest else "")
 
 
 def _way(metres: float) -> str:
     """Write a distance."""
-    return f"{metres:,.0f} m" if metres < 2000 else f"{metres / 1000:,.1f} km"
+    return f"{metres:,.0f}\u00a0m" if metres < 2000 else f"{metres / 1000:,.1f}\u00a0km"
 
 
 def _zero(track: Track) -> float:
@@ -277,7 +267,12 @@ def _zero(track: Track) -> float:
 
 def _time(track: Track, t: float) -> str:
     """Write a moment of the drive."""
-    return f"{t - _zero(track):,.1f} s".replace(".0 s", " s")
+    return f"{t - _zero(track):,.1f}\u00a0s".replace(".0\u00a0", "\u00a0")
+
+
+def _moment(track: Track, t: float) -> str:
+    """Write a moment of the drive in a table."""
+    return f"{t - _zero(track):,.1f}"
 
 
 def _metres(value: float) -> str:
@@ -476,7 +471,7 @@ def _behind_map(track: Track) -> str:
     """Give positions as a table."""
     body = [
         [
-            _time(track, track.t_s[k])[:-2],
+            _moment(track, track.t_s[k]),
             f"{track.lat_deg[k]:.6f}",
             f"{track.lon_deg[k]:.6f}",
             _metres(float(track.east_half_m[k])),
@@ -639,7 +634,7 @@ def _behind_chart(track: Track, head: Sequence[str], columns: Sequence[Floats], 
     """Give a chart's values as a table."""
     body = [
         [
-            _time(track, track.t_s[k])[:-2],
+            _moment(track, track.t_s[k]),
             *(_known(float(column[k]), pattern) for column in columns),
             str(track.quality[k]),
         ]
@@ -658,8 +653,8 @@ def _gap_cells(track: Track, gap: Gap) -> list[str]:
     number = track.gaps.index(gap) + 1
     return [
         str(number),
-        _time(track, gap.start)[:-2],
-        _time(track, gap.stop)[:-2],
+        _moment(track, gap.start),
+        _moment(track, gap.stop),
         f"{gap.duration_s:.1f}",
         f"{gap.distance_m:,.0f}",
         _metres(gap.max_half_m),
@@ -707,8 +702,30 @@ def _gap_cells_numbered(track: Track, gap: Gap, number: int) -> list[str]:
 
 def _fault_section(track: Track) -> str:
     """Say what is wrong with the log, and what its reader did about it."""
-    found = sorted(check(track.log).items, key=lambda item: list(_VERDICTS).index(item.verdict))
-    faults = sum(item.verdict in ("bad", "warn") for item in found)
+    items = check(track.log).items
+    told = sorted(
+        (item for item in items if item.verdict != "ok"), key=lambda item: list(_VERDICTS).index(item.verdict)
+    )
+    right = [item for item in items if item.verdict == "ok"]
+    faults = sum(item.verdict != "not checked" for item in told)
+    notes = "".join(f"<li>{_t(note)}</li>" for note in track.log.notes)
+    return (
+        '<section>\n<h2>The log</h2>\n<p class="about">'
+        f"{_count(len(track.log), 'row')}."
+        f" <strong>{_count(faults, 'fault') if faults else 'No fault'} found.</strong></p>"
+        + (_item_table(told) if told else "")
+        + (
+            f"<details><summary>{_count(len(right), 'point')} in order</summary>{_item_table(right)}</details>"
+            if right
+            else ""
+        )
+        + (f"<details><summary>While reading</summary><ul>{notes}</ul></details>" if notes else "")
+        + "</section>\n"
+    )
+
+
+def _item_table(items: Iterable[Item]) -> str:
+    """Write the points of a check as a table."""
     body = [
         [
             '<span class="{}">{}</span>'.format(*_VERDICTS[item.verdict]),
@@ -716,29 +733,11 @@ def _fault_section(track: Track) -> str:
             _t(item.sentence),
             f"<code>{_t(item.line)}</code>" if item.line else "",
         ]
-        for item in found
+        for item in items
     ]
-    head = (
-        ["verdict", "looked at", "found", "to type"]
-        if any(row[3] for row in body)
-        else ["verdict", "looked at", "found"]
-    )
-    table = _table(head, [row[: len(head)] for row in body], words=range(4))
-    notes = "".join(f"<li>{_t(note)}</li>" for note in track.log.notes)
-    told = f"{_count(faults, 'fault')} found." if faults else "No fault found."
-    return (
-        f'<section>\n<h2>The log</h2>\n<p class="about">{_t(_streams(track))} <strong>{told}</strong></p>{table}'
-        + (f"<h3>While reading</h3><ul>{notes}</ul>" if notes else "")
-        + "</section>\n"
-    )
-
-
-def _streams(track: Track) -> str:
-    """Name the streams of the log with their rates."""
-    known = [
-        f"{_STREAMS.get(name, name)} at {rate:.3g} Hz" for name, rate in track.log.rates().items() if rate is not None
-    ]
-    return f"{_count(len(track.log), 'row')}: {', '.join(known) or 'no stream'}."
+    used = 4 if any(row[3] for row in body) else 3
+    head = ["verdict", "looked at", "found", "to type"][:used]
+    return _table(head, [row[:used] for row in body], words=range(4))
 
 
 def _benchmark_section(track: Track) -> str:

@@ -17,7 +17,7 @@
   const map = $("map"), frame = $("frame"), slider = $("when"), readout = $("now");
   const drawn = { x: data.view[0], y: data.view[1], w: data.view[2], h: data.view[3] };
   let whole = drawn, view = drawn;
-  let span = [t[0], t[last]];
+  let span = [t[0], Math.max(t[last], t[0] + 1e-6)];
   let current = 0;
 
   // ---- the map: looking closer -------------------------------------------------------------------
