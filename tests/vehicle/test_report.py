@@ -153,6 +153,29 @@ def test_table_of_gaps_has_every_gap():
         ]
 
 
+class Result:
+    """What the outage benchmark gives."""
+
+    def rows(self):
+        cell = {"starts": 10, "mean_se_m": 0.1, "failed": 0}
+        return [
+            {"method": "linear", "length_s": 5.0, "mean_m": 1.2, "max_m": 2.0, "coverage": None, **cell},
+            {"method": "linear", "length_s": 30.0, "mean_m": 17.0, "max_m": 33.0, "coverage": None, **cell},
+            {"method": "em_chain", "length_s": 5.0, "mean_m": 0.17, "max_m": 0.33, "coverage": 1.0, **cell},
+            {"method": "em_chain", "length_s": 30.0, "mean_m": 0.42, "max_m": 0.89, "coverage": 0.79, **cell},
+        ]
+
+
+def test_benchmark_of_this_very_log_is_shown_and_said_first():
+    text = Reader(page(made_track(benchmark=Result()))).text().replace("\u00a0", " ")
+    # (5 * 1 + 30 * 0.79) / 35
+    assert "fixes hidden for 5 to 30 s and filled again, 82 % of them lay inside" in text
+    assert text.index("82 %") < text.index("Local metres")
+    assert "em_chain: mean / largest, m inside the 90 % interval linear: mean / largest, m" in text
+    assert "30 10 0.42 / 0.89 79 % 17.00 / 33.00" in text
+    assert "Tested on this very log" not in Reader(page(made_track())).text()
+
+
 def test_faults_of_the_log_are_named():
     t = np.arange(120) / 10
     text = Reader(page(made_track())).text()

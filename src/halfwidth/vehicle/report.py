@@ -15,7 +15,6 @@ import json
 import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, is_dataclass
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -185,7 +184,8 @@ def notebook(track: Track) -> str:
         if gap
     )
     shown = sorted(track.gaps, key=lambda gap: -gap.max_half_m)[:8]
-    body = [_gap_cells(track, gap) for gap in sorted(shown, key=lambda gap: gap.start)]
+    numbers = {id(gap): k for k, gap in enumerate(track.gaps)}
+    body = [_gap_cells(track, gap, numbers[id(gap)]) for gap in sorted(shown, key=lambda gap: gap.start)]
     more = len(track.gaps) - len(shown)
     return (
         f"<div><p><b>{_t(_title(track))}</b>: {_t(verdict(track))}</p>"
@@ -648,11 +648,10 @@ def _behind_chart(track: Track, head: Sequence[str], columns: Sequence[Floats], 
 _GAP_HEAD = ("gap", "from, s", "to, s", "length, s", "distance, m", "half-width, m", "kind")
 
 
-def _gap_cells(track: Track, gap: Gap) -> list[str]:
+def _gap_cells(track: Track, gap: Gap, number: int) -> list[str]:
     """Write a gap as cells."""
-    number = track.gaps.index(gap) + 1
     return [
-        str(number),
+        str(number + 1),
         _moment(track, gap.start),
         _moment(track, gap.stop),
         f"{gap.duration_s:.1f}",
@@ -674,7 +673,7 @@ def _gap_section(track: Track, limits: Sequence[float]) -> str:
     numbers = {id(gap): k for k, gap in enumerate(track.gaps)}
     body = []
     for gap in shown:
-        cells = _gap_cells_numbered(track, gap, numbers[id(gap)])
+        cells = _gap_cells(track, gap, numbers[id(gap)])
         index = int(np.searchsorted(np.asarray(limits), gap.max_half_m, side="right"))
         colour = picture.colour_of(index, len(limits) + 1)
         cells[5] = f'<span class="swatch h{colour}"></span>{cells[5]}'
@@ -693,11 +692,6 @@ def _gap_section(track: Track, limits: Sequence[float]) -> str:
         marked=[worst],
     )
     return f'<section>\n<h2>Gaps</h2>\n<p class="about">{left_out.strip()}</p>{table}</section>\n'
-
-
-def _gap_cells_numbered(track: Track, gap: Gap, number: int) -> list[str]:
-    """Write a gap as cells under a number that is known."""
-    return [str(number + 1), *_gap_cells(track, gap)[1:]]
 
 
 def _fault_section(track: Track) -> str:
@@ -741,35 +735,68 @@ def _item_table(items: Iterable[Item]) -> str:
 
 
 def _benchmark_section(track: Track) -> str:
-    """Show how well the method did on this log's own fixes, hidden and filled again."""
-    if track.benchmark is None:
-        return ""
+    """Show how far off the method was on this log's own fixes, hidden and filled again."""
     rows = _records(track.benchmark)
+    if not rows:
+        return ""
+    known = all({"method", "length_s", "mean_m", "max_m", "coverage"} <= row.keys() for row in rows)
+    table = _outage_table(track, rows) if known else _record_table(rows)
     return (
-        "<section>\n<h2>Outages made in this very log</h2>\n"
-        '<p class="about">Fixes of this log were hidden and filled again; errors are distances to the'
-        f" hidden fixes, so they include the fixes' own errors.</p>{_record_table(rows)}</section>\n"
+        '<section>\n<h2>Outages made in this very log</h2>\n<p class="about">Fixes of this log were hidden and filled'
+        " again. Errors are distances to the hidden fixes, so they include the fixes’ own errors.</p>"
+        f"{table}</section>\n"
+    )
+
+
+def _outage_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Write one line for each length of outage, with the errors of each method side by side."""
+    methods = list(dict.fromkeys(str(row["method"]) for row in rows))
+    methods.sort(key=lambda name: name != track.method)
+    cells = {(str(row["method"]), float(row["length_s"])): row for row in rows}
+    tested = any(row["coverage"] is not None and row["method"] == track.method for row in rows)
+    head = ["outage, s", "starts", *(f"{name}: mean / largest, m" for name in methods)]
+    if tested:
+        head.insert(3, f"inside the {100 * track.level:g} % interval")
+    body = []
+    for length in sorted({length for _, length in cells}):
+        found = [cells.get((name, length)) for name in methods]
+        line = [f"{length:g}", str(next((row["starts"] for row in found if row and "starts" in row), "–"))]
+        line += ["–" if row is None else f"{row['mean_m']:.2f} / {row['max_m']:.2f}" for row in found]
+        if tested:
+            own = cells.get((track.method, length))
+            share = None if own is None else own["coverage"]
+            line.insert(3, "–" if share is None else f"{100 * share:.0f} %")
+        body.append([_t(cell) for cell in line])
+    return _table(
+        [_t(name) for name in head],
+        body,
+        caption="Mean error, and the mean over the starts of the largest error in each outage.",
     )
 
 
 def _tested(track: Track) -> str:
     """Say what hiding this log's own fixes showed about the bound."""
-    return ""
+    rows = [
+        row
+        for row in _records(track.benchmark)
+        if row.get("method") == track.method and row.get("coverage") is not None and row.get("length_s")
+    ]
+    if not rows:
+        return ""
+    weights = [float(row["length_s"]) * float(row.get("starts", 1)) for row in rows]
+    share = sum(w * float(row["coverage"]) for w, row in zip(weights, rows, strict=True)) / sum(weights)
+    low, high = (pick(float(row["length_s"]) for row in rows) for pick in (min, max))
+    lengths = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return (
+        f" Tested on this very log: with its own fixes hidden for {lengths}\u00a0s and filled again,"
+        f" {100 * share:.0f}\u00a0% of them lay inside."
+    )
 
 
 def _records(value: Any) -> list[dict[str, Any]]:
-    """Read a result as rows: a sequence, or something with rows, of mappings or dataclasses."""
-    rows = getattr(value, "rows", value)
-    rows = rows() if callable(rows) else rows
-    records = []
-    for row in rows if isinstance(rows, Iterable) else ():
-        if is_dataclass(row) and not isinstance(row, type):
-            records.append(asdict(row))
-        elif isinstance(row, Mapping):
-            records.append({str(key): item for key, item in row.items()})
-        else:
-            records.append({"": row})
-    return records
+    """Read a result as rows: a sequence of mappings, or something whose `rows` gives one."""
+    rows = value.rows() if hasattr(value, "rows") else value
+    return [{str(key): item for key, item in row.items()} for row in rows or () if isinstance(row, Mapping)]
 
 
 def _record_table(rows: Sequence[Mapping[str, Any]]) -> str:
