@@ -415,7 +415,7 @@ def _map_section(track: Track, plane: Plane, view: View, rows: Rows, limits: Seq
         f' aria-label="{_t(_map_words(track))}">\n'
         f'<svg id="map" viewBox="{view.box()}" aria-hidden="true">{drawn}'
         '<rect id="box" class="live hide"/><path id="here" class="live hide"/></svg>\n'
-        f"{pins}\n"
+        f'{pins}<div class="tip live hide" id="tip" aria-hidden="true"></div>\n'
         '<div class="north" aria-hidden="true"><svg viewBox="0 0 20 26"><path d="M10 0l8 26-8-6-8 6z"/>'
         "</svg>N</div>\n"
         f'<div class="bar" id="bar"><span id="barlength">{_length(length)}</span></div>\n</div></div>\n'

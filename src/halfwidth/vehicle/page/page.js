@@ -14,7 +14,7 @@
   const quality = [];
   for (const [kind, count] of data.q) for (let k = 0; k < count; k++) quality.push(kind);
   const last = t.length - 1;
-  const map = $("map"), frame = $("frame"), slider = $("when"), readout = $("now");
+  const map = $("map"), frame = $("frame"), slider = $("when"), readout = $("now"), tip = $("tip");
   const drawn = { x: data.view[0], y: data.view[1], w: data.view[2], h: data.view[3] };
   let whole = drawn, view = drawn;
   let span = [t[0], Math.max(t[last], t[0] + 1e-6)];
@@ -51,6 +51,17 @@
       pin.style.top = `${top}%`;
       pin.classList.toggle("hide", left < 0 || left > 100 || top < 0 || top > 100);
     }
+    drawTip();
+  }
+
+  function drawTip() {
+    const left = (100 * (x[current] - view.x)) / view.w, top = (100 * (y[current] - view.y)) / view.h;
+    tip.classList.toggle("hide", left < 0 || left > 100 || top < 0 || top > 100);
+    tip.classList.toggle("left", left > 65);
+    tip.classList.toggle("above", top > 80);
+    tip.style.left = `${left}%`;
+    tip.style.top = `${top}%`;
+    tip.textContent = `${clock(current).split(" (")[0]} · ± ${Math.max(east[current], north[current]).toFixed(2)} m`;
   }
 
   // the whole drive in whatever shape the map has on this screen
@@ -71,7 +82,13 @@
     drawMap();
   }
 
-  function zoom(factor, cx = view.x + view.w / 2, cy = view.y + view.h / 2) {
+  // about the marked place if it is in sight, else about the middle
+  const middle = () => {
+    const dx = x[current] - view.x, dy = y[current] - view.y;
+    return dx > 0 && dx < view.w && dy > 0 && dy < view.h ? [x[current], y[current]] : [view.x + view.w / 2, view.y + view.h / 2];
+  };
+
+  function zoom(factor, cx = middle()[0], cy = middle()[1]) {
     const w = Math.min(Math.max(view.w * factor, 4 / data.unit), 4 * whole.w);
     const real = w / view.w;
     look({ x: cx - (cx - view.x) * real, y: cy - (cy - view.y) * real, w, h: view.h * real });
@@ -142,6 +159,7 @@
     readout.textContent = text;
     slider.value = String(current);
     slider.setAttribute("aria-valuetext", text);
+    drawTip();
     drawNow();
   }
 
