@@ -6,9 +6,9 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BadLog BadRecord BadShape BadValue Box Cloud DataQualityWarning Estimate Estimator Gaussian HalfwidthError Linear
-Missing Mixed Nonlinear Normal Record Recursive Refused Status Uniform Unsolved __version__ estimate from_continuous
-score simulate
+BadLog BadRecord BadShape BadValue Box Cloud DataQualityWarning Estimate Estimator Gaussian HalfwidthError
+KalmanFilter KalmanSmoother Learned Linear Missing Mixed Nonlinear Normal Record Recursive Refused Status Uniform
+Unsolved __version__ estimate forecast from_continuous learn resume score simulate stream
 """
 
 

@@ -31,6 +31,11 @@ _HOME: dict[str, str] = {
     "estimate": "estimate",
     "simulate": "simulate",
     "score": "score",
+    "stream": "stream",
+    "resume": "stream",
+    "forecast": "forecast",
+    "learn": "learn",
+    "Learned": "learn",
     "HalfwidthError": "errors",
     "BadShape": "errors",
     "BadValue": "errors",
@@ -60,6 +65,9 @@ if TYPE_CHECKING:
     from halfwidth.errors import Refused as Refused
     from halfwidth.errors import Unsolved as Unsolved
     from halfwidth.estimate import estimate as estimate
+    from halfwidth.forecast import forecast as forecast
+    from halfwidth.learn import Learned as Learned
+    from halfwidth.learn import learn as learn
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
     from halfwidth.model import Linear as Linear
@@ -75,6 +83,8 @@ if TYPE_CHECKING:
     from halfwidth.spread import Box as Box
     from halfwidth.spread import Cloud as Cloud
     from halfwidth.spread import Normal as Normal
+    from halfwidth.stream import resume as resume
+    from halfwidth.stream import stream as stream
 
 
 def __getattr__(name: str) -> Any:
