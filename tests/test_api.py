@@ -7,7 +7,7 @@ import halfwidth as hw
 
 NAMES = """
 BadLog BadRecord BadShape BadValue Box Cloud DataQualityWarning Estimate Estimator Gaussian HalfwidthError
-KalmanFilter KalmanSmoother Learned Linear Missing Mixed Nonlinear Normal Record Recursive Refused Status Uniform
+KalmanFilter KalmanSmoother Learned Linear LogTooBig Missing Mixed Nonlinear Normal Record Recursive Refused Status Uniform
 Unsolved __version__ estimate forecast from_continuous learn resume score simulate stream
 """
 
@@ -30,3 +30,11 @@ def test_importing_loads_no_optional_library():
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+def test_importing_a_module_does_not_hide_the_function_of_its_name():
+    code = (
+        "import halfwidth as hw; from halfwidth.estimate import fits; from halfwidth.vehicle.check import Item;"
+        "assert hw.estimate.__name__ == 'estimate' and hw.vehicle.check.__name__ == 'check'"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)

@@ -8,6 +8,8 @@ the user. NaN in y is a missing entry.
 """
 
 import importlib
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from halfwidth.methods import ESTIMATORS
@@ -50,6 +52,9 @@ _HOME: dict[str, str] = {
     "Recursive": "methods._protocol",
 } | {name: f"methods.{module}" for name, module in ESTIMATORS.items()}
 
+#: Packages that are part of the public names, loaded when first used as well.
+_PACKAGES = ("vehicle",)
+
 __all__ = ["__version__", *sorted(_HOME)]
 
 if TYPE_CHECKING:
@@ -88,6 +93,8 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return importlib.import_module(f"halfwidth.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'halfwidth' has no attribute {name!r}")
     value = getattr(importlib.import_module(f"halfwidth.{_HOME[name]}"), name)
@@ -97,3 +104,15 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return list(__all__)
+
+
+class _Front(ModuleType):
+    """Keeps a public function from being hidden by the module of the same name once that is imported."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if isinstance(value, ModuleType) and name in _HOME:
+            value = getattr(value, name)
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Front

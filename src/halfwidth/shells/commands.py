@@ -111,6 +111,9 @@ def fill(
             show_default=False,
         ),
     ] = None,
+    format_: Annotated[
+        str | None, typer.Option("--format", metavar="NAME", help="Format of the track, where its name does not say.")
+    ] = None,
     report: Annotated[str | None, typer.Option(metavar="HTML", help="Report to write: one HTML page.")] = None,
     method: Annotated[str | None, typer.Option(metavar="NAME", help="Estimator; the default needs no tuning.")] = None,
     level: Level = 0.9,
@@ -139,7 +142,7 @@ def fill(
         raise _usage("`-o` and `--report` both claim standard output", "--report FILE")
     _method_known(method)
     if output is not None:
-        _ending_known(output)
+        _ending_known(output, format_)
     for path in (output, report):
         _writable(path, log, force)
     job = Job("fill", log, method=method, level=level, settings={"clock_offset": clock_offset},
@@ -158,6 +161,8 @@ def fill(
             _print_json(plan)
         else:
             _words(f"would fill {found!r}", quiet)
+            for note in found.notes:
+                _words(f"note: {note}", quiet)
             for path in outputs:
                 _words(f"would write {path}", quiet)
         return cli.GOOD
@@ -170,7 +175,7 @@ def fill(
         if report is not None:
             track.report(report, command=command)
         if output is not None:
-            track.write(output)
+            track.write(output, format=format_)
     if json_:
         written = {"track": output, "report": report}
         _print_json(_track_json(track, written, command, time.perf_counter() - started))
@@ -402,12 +407,14 @@ def _method_known(name: str | None) -> None:
         )
 
 
-def _ending_known(path: str) -> None:
-    from halfwidth.vehicle.write import FORMATS
+def _ending_known(path: str, format_: str | None) -> None:
+    """Refuse a format that is not there before any work is done."""
+    from halfwidth.vehicle.write import ending
 
-    if path != "-" and not path.lower().endswith(tuple(f".{name.lstrip('.')}" for name in FORMATS)):
-        known = ", ".join(f".{name.lstrip('.')}" for name in FORMATS)
-        raise _usage(f"`{path}` ends in no known format, one of {known} is expected", "-o track.csv")
+    try:
+        ending(path, format_)
+    except BadValue as error:
+        raise _usage(error.message, error.hint or "-o track.csv") from error
 
 
 def _writable(path: str | None, log: str, force: bool) -> None:
@@ -417,13 +424,13 @@ def _writable(path: str | None, log: str, force: bool) -> None:
     target = Path(path)
     folder = target.parent
     try:
-        if target.is_dir():
+        if os.path.isdir(target):
             raise _usage(f"`{path}` is a directory, a file is expected", f"-o {path.rstrip('/')}/track.csv")
-        if log != "-" and target.exists() and os.path.exists(log) and os.path.samefile(target, log):
+        if log != "-" and os.path.exists(target) and os.path.exists(log) and os.path.samefile(target, log):
             raise _usage(f"`{path}` is the input itself", "give another name, the input is never overwritten")
-        if target.is_file() and not force:
+        if os.path.isfile(target) and not force:
             raise _usage(f"`{path}` exists already", "--force overwrites it")
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             raise _usage(
                 f"`{folder}` is no folder, so `{path}` cannot be written", f"mkdir -p {shlex.quote(str(folder))}"
             )

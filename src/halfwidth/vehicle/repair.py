@@ -168,7 +168,7 @@ def _time(raw: Raw, notes: list[str]) -> tuple[Floats, float | None]:
     first = float(values[np.isfinite(values)][0])
     if "week" in raw.values:
         week = raw.values["week"]
-        scale = FACTORS["time"][use.unit] if use.unit else 1e-3 if np.nanmax(values) > 604_800 else 1.0
+        scale = FACTORS["time"][use.unit] if use.unit else 1e-3 if np.nanmax(values) > 1e6 else 1.0
         base = np.nanmin(week) if np.isfinite(week).any() else 0.0
         t = (week - base) * 604_800 + values * scale
         start = float(t[np.isfinite(t)][0]) if np.isfinite(t).any() else 0.0

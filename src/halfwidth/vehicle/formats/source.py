@@ -2,14 +2,13 @@
 
 Whatever arrives is untrusted. Bytes are handed out in blocks, so no size is ever taken on trust;
 a gzip stream is refused as soon as it has expanded further than any real log does, and one that
-breaks off keeps what came before the break, with a note.
+breaks off keeps what came before the break, with a note; one that is damaged is refused.
 """
 
 import os
 import sys
 import zlib
 from dataclasses import dataclass
-from pathlib import Path
 from typing import BinaryIO, Protocol
 
 from halfwidth.errors import BadLog, LogTooBig
@@ -135,10 +134,12 @@ class Source:
             try:
                 block = self._zip.decompress(self._tail, BLOCK)
             except zlib.error as error:
-                self.damage = f"the gzip stream is damaged ({error})"
-                self._tail = b""
-                self._stream = _Empty()
-                return b""
+                # what was decoded so far may be wrong without looking wrong: nothing is kept
+                words = str(error).rpartition(": ")[2]
+                raise BadLog(
+                    f"`{self.name}` is a damaged gzip file ({words}, near byte {self._n_in - len(self._tail)})",
+                    hint="copy it again from where it came from",
+                ) from error
             self._tail = self._zip.unconsumed_tail
             if self._zip.eof:
                 rest = self._zip.unused_data or self._raw(BLOCK >> 3)
@@ -162,7 +163,7 @@ class Source:
         if (
             self._zip is not None
             and self._n_out > self.limits.ratio_from
-            and self._n_out > self.limits.ratio * max(self._n_in, 1)
+            and self._n_out > self.limits.ratio * max(self._n_in - len(self._tail), 1)
         ):
             raise LogTooBig(
                 f"`{self.name}` expands more than {self.limits.ratio:g} times, which no real log"
@@ -213,7 +214,7 @@ def open_source(path: str | os.PathLike[str], limits: Limits) -> tuple[Source, B
         return Source(stream, "-", limits), stream
     if "\0" in name:
         raise BadLog(f"`path` is {name!r}, a path without NUL is expected")
-    if Path(name).is_dir():
+    if os.path.isdir(name):
         raise BadLog(
             f"`{name}` is a directory, a log file is expected\nhint: give one file; a folder of"
             " logs is a shell loop away"
