@@ -7,7 +7,7 @@ import pandas
 import polars
 import pyarrow
 import pytest
-from made_tracks import made_track
+from tests.vehicle.made_tracks import made_track
 
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.vehicle.track import COLUMNS, Gap, gaps_of, runs, since_fix_of, steps_m

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import gpxpy
 import numpy as np
@@ -14,7 +15,7 @@ import pandas
 import pyarrow.parquet
 import pytest
 from lxml import etree
-from made_tracks import made_track
+from tests.vehicle.made_tracks import made_track
 
 from halfwidth.errors import BadValue, Missing
 from halfwidth.vehicle import write as module
@@ -441,14 +442,14 @@ def test_writer_does_not_load_what_it_does_not_need(tmp_path):
     """A CSV or GPX file needs neither pandas nor pyarrow."""
     code = (
         "import sys; sys.path[:0] = sys.argv[2:]\n"
-        "from made_tracks import made_track\n"
+        "from tests.vehicle.made_tracks import made_track\n"
         "track = made_track()\n"
         "for end in ('csv', 'gpx', 'kml', 'geojson'): track.write(sys.argv[1] + '/a.' + end)\n"
         "print([m for m in ('pandas', 'polars', 'pyarrow', 'scipy') if m in sys.modules])"
     )
     here = str(module.__file__).rsplit("/halfwidth/", 1)[0]
     run = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path), here, str(__file__).rsplit("/", 1)[0]],
+        [sys.executable, "-c", code, str(tmp_path), here, str(Path(__file__).parents[2])],
         capture_output=True,
         text=True,
     )

@@ -210,7 +210,9 @@ def check(log: Any) -> Check:
         _standstill(log),
         *_steps(log),
         _speed_scale(log),
-        _yaw_bias(log) if moving[3].verdict != "bad" else Item("yaw bias", "not checked", "put the yaw rate right first"),
+        _yaw_bias(log)
+        if moving[3].verdict != "bad"
+        else Item("yaw bias", "not checked", "put the yaw rate right first"),
         Item("clock offset", "not checked", "the offset between fixes and sensors is not estimated yet"),
     )
     length = float(log.t[-1] - log.t[0]) if len(log) else 0.0

@@ -265,7 +265,8 @@ def map_svg(track: Track, plane: Plane, view: View, rows: Rows, limits: Sequence
     out.append(f'<path id="fixes" class="fix" d="{dots(fx, fy)}"/>')
     out.append(f'<g id="filled" class="gap">{"".join(gaps)}</g>')
     out.append(f'<path class="start" d="{dots(x[:1], y[:1])}"/>')
-    out.append(f'<path class="end" d="{dots(x[-1:], y[-1:])}"/>')
+    # a square needs a direction, so its path has a length
+    out.append(f'<path class="end" d="M{x[-1]:.0f},{y[-1]:.0f}h.1"/>')
     return "".join(out)
 
 

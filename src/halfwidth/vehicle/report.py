@@ -15,7 +15,6 @@ import json
 import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, is_dataclass
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -26,24 +25,26 @@ import numpy as np
 from halfwidth import __version__
 from halfwidth.store import atomic_write
 from halfwidth.vehicle import picture
+from halfwidth.vehicle.check import Item, check
 from halfwidth.vehicle.picture import CHART_HEIGHT, CHART_WIDTH, Floats, Plane, Rows, View
 from halfwidth.vehicle.track import Gap, Track, runs, steps_m
 
 #: Rows of a table behind a chart, gaps in the table of gaps and pins on the map, at most.
 _BEHIND, _MOST_GAPS, _MOST_PINS = 60, 500, 20
 
-#: Names of the streams for readers.
-_STREAMS = {
-    "alt_m": "height",
-    "azimuth_rad": "course",
-    "speed_mps": "speed",
-    "yaw_rate_radps": "yaw rate",
-    "ax_mps2": "forward acceleration",
-    "ay_mps2": "sideways acceleration",
+#: How the verdicts of a check look, the worst first: a sign as well as a colour.
+_VERDICTS = {
+    "bad": ("bad", "✗ bad"),
+    "warn": ("warn", "! warning"),
+    "ok": ("ok", "✓ ok"),
+    "not checked": ("none", "– not checked"),
 }
 
 #: A dot and a dash of the legend.
 _DOT, _DASH = "M15 6h0", "M3 6h24"
+
+#: Width over height of the map on narrow screens.
+_NARROW = 1.15
 
 #: Every other mark of the time axis, which narrow screens leave out.
 _ODD = ("", " odd")
@@ -97,7 +98,7 @@ def verdict(track: Track) -> str:
 
 def kind_of_bound(track: Track) -> str:
     """Say what kind of bound the half-widths are, and what the log itself says about that."""
-    share = f"{100 * track.level:g} %"
+    share = f"{100 * track.level:g}\u00a0%"
     words = {
         "proven": (
             "proven bound",
@@ -183,7 +184,8 @@ def notebook(track: Track) -> str:
         if gap
     )
     shown = sorted(track.gaps, key=lambda gap: -gap.max_half_m)[:8]
-    body = [_gap_cells(track, gap) for gap in sorted(shown, key=lambda gap: gap.start)]
+    numbers = {id(gap): k for k, gap in enumerate(track.gaps)}
+    body = [_gap_cells(track, gap, numbers[id(gap)]) for gap in sorted(shown, key=lambda gap: gap.start)]
     more = len(track.gaps) - len(shown)
     return (
         f"<div><p><b>{_t(_title(track))}</b>: {_t(verdict(track))}</p>"
@@ -241,23 +243,21 @@ def _count(number: int, word: str) -> str:
 
 
 def _size(metres: float) -> str:
-    """Write a half-width: ± with two figures or so."""
-    if metres < 10:
-        return f"± {metres:.2f} m" if metres < 1 else f"± {metres:.1f} m"
-    return f"± {metres:,.0f} m"
+    """Write a half-width: ± with two figures or so, never broken between lines."""
+    return f"±\u00a0{metres:.2f}\u00a0m" if metres < 1 else f"±\u00a0{metres:,.{1 if metres < 10 else 0}f}\u00a0m"
 
 
 def _span(seconds: float) -> str:
     """Write a length of time."""
     if seconds < 100:
-        return f"{seconds:.1f} s".replace(".0 s", " s")
+        return f"{seconds:.1f}\u00a0s".replace(".0\u00a0", "\u00a0")
     minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes:,} min {rest} s" if minutes else f"{rest} s"
+    return f"{minutes:,}\u00a0min" + (f" {rest}\u00a0s" if rest else "")
 
 
 def _way(metres: float) -> str:
     """Write a distance."""
-    return f"{metres:,.0f} m" if metres < 2000 else f"{metres / 1000:,.1f} km"
+    return f"{metres:,.0f}\u00a0m" if metres < 2000 else f"{metres / 1000:,.1f}\u00a0km"
 
 
 def _zero(track: Track) -> float:
@@ -267,7 +267,12 @@ def _zero(track: Track) -> float:
 
 def _time(track: Track, t: float) -> str:
     """Write a moment of the drive."""
-    return f"{t - _zero(track):,.1f} s".replace(".0 s", " s")
+    return f"{t - _zero(track):,.1f}\u00a0s".replace(".0\u00a0", "\u00a0")
+
+
+def _moment(track: Track, t: float) -> str:
+    """Write a moment of the drive in a table."""
+    return f"{t - _zero(track):,.1f}"
 
 
 def _metres(value: float) -> str:
@@ -389,7 +394,7 @@ def _map_section(track: Track, plane: Plane, view: View, rows: Rows, limits: Seq
         items.append(stroke.format("dash", _DASH, "extrapolated: fixes on one side only"))
     if track.gaps:
         items.append(stroke.format("band", _DASH, "half-width across the way"))
-    items += [stroke.format("ends", _DOT, "start"), stroke.format("ends square", _DOT, "end")]
+    items += [stroke.format("ends", _DOT, "start"), stroke.format("ends square", "M15 6h.1", "end")]
     step = picture.round_step(view.width * plane.unit_m / 12)
     tools = [("closer", "+", "Zoom in"), ("wider", "−", "Zoom out"), ("all", "Whole drive", "")]
     tools += [("previous", "‹ Gap", "Previous gap"), ("next", "Gap ›", "Next gap")]
@@ -405,14 +410,15 @@ def _map_section(track: Track, plane: Plane, view: View, rows: Rows, limits: Seq
         f'{_length(step)}</span>.{thinned} <span class="live hide">Drag to move; click, then turn the'
         " wheel to zoom; keys: arrows, + − 0, n and p for the next and previous gap, comma and full"
         " stop to step in time.</span></p>\n"
+        f'<div class="stage"><div class="tools live hide">{buttons}</div>\n'
         '<div class="map" id="frame" tabindex="0" role="application" aria-roledescription="map"'
         f' aria-label="{_t(_map_words(track))}">\n'
         f'<svg id="map" viewBox="{view.box()}" aria-hidden="true">{drawn}'
         '<rect id="box" class="live hide"/><path id="here" class="live hide"/></svg>\n'
-        f'{pins}<div class="tools live hide">{buttons}</div>\n'
+        f'{pins}<div class="tip live hide" id="tip" aria-hidden="true"></div>\n'
         '<div class="north" aria-hidden="true"><svg viewBox="0 0 20 26"><path d="M10 0l8 26-8-6-8 6z"/>'
         "</svg>N</div>\n"
-        f'<div class="bar" id="bar"><span id="barlength">{_length(length)}</span></div>\n</div>\n'
+        f'<div class="bar" id="bar"><span id="barlength">{_length(length)}</span></div>\n</div></div>\n'
         f'<ul class="legend">{"".join(f"<li>{item}</li>" for item in items)}</ul>\n'
         '<div class="cursor live hide"><label for="when">moment</label>'
         f'<input type="range" id="when" min="0" max="{rows.size - 1}" step="1" value="0">'
@@ -465,7 +471,7 @@ def _behind_map(track: Track) -> str:
     """Give positions as a table."""
     body = [
         [
-            _time(track, track.t_s[k])[:-2],
+            _moment(track, track.t_s[k]),
             f"{track.lat_deg[k]:.6f}",
             f"{track.lon_deg[k]:.6f}",
             _metres(float(track.east_half_m[k])),
@@ -628,7 +634,7 @@ def _behind_chart(track: Track, head: Sequence[str], columns: Sequence[Floats], 
     """Give a chart's values as a table."""
     body = [
         [
-            _time(track, track.t_s[k])[:-2],
+            _moment(track, track.t_s[k]),
             *(_known(float(column[k]), pattern) for column in columns),
             str(track.quality[k]),
         ]
@@ -642,13 +648,12 @@ def _behind_chart(track: Track, head: Sequence[str], columns: Sequence[Floats], 
 _GAP_HEAD = ("gap", "from, s", "to, s", "length, s", "distance, m", "half-width, m", "kind")
 
 
-def _gap_cells(track: Track, gap: Gap) -> list[str]:
+def _gap_cells(track: Track, gap: Gap, number: int) -> list[str]:
     """Write a gap as cells."""
-    number = track.gaps.index(gap) + 1
     return [
-        str(number),
-        _time(track, gap.start)[:-2],
-        _time(track, gap.stop)[:-2],
+        str(number + 1),
+        _moment(track, gap.start),
+        _moment(track, gap.stop),
         f"{gap.duration_s:.1f}",
         f"{gap.distance_m:,.0f}",
         _metres(gap.max_half_m),
@@ -664,11 +669,11 @@ def _gap_section(track: Track, limits: Sequence[float]) -> str:
     left_out = ""
     if len(shown) > _MOST_GAPS:
         shown = sorted(sorted(shown, key=lambda g: -g.max_half_m)[:_MOST_GAPS], key=lambda g: g.start)
-        left_out = f" The {_MOST_GAPS} known worst of {len(track.gaps):,} are listed."
+        left_out = f'<p class="about">The {_MOST_GAPS} known worst of {len(track.gaps):,} are listed.</p>'
     numbers = {id(gap): k for k, gap in enumerate(track.gaps)}
     body = []
     for gap in shown:
-        cells = _gap_cells_numbered(track, gap, numbers[id(gap)])
+        cells = _gap_cells(track, gap, numbers[id(gap)])
         index = int(np.searchsorted(np.asarray(limits), gap.max_half_m, side="right"))
         colour = picture.colour_of(index, len(limits) + 1)
         cells[5] = f'<span class="swatch h{colour}"></span>{cells[5]}'
@@ -689,72 +694,109 @@ def _gap_section(track: Track, limits: Sequence[float]) -> str:
     return f'<section>\n<h2>Gaps</h2>\n<p class="about">{left_out.strip()}</p>{table}</section>\n'
 
 
-def _gap_cells_numbered(track: Track, gap: Gap, number: int) -> list[str]:
-    """Write a gap as cells under a number that is known."""
-    return [str(number + 1), *_gap_cells(track, gap)[1:]]
-
-
 def _fault_section(track: Track) -> str:
     """Say what is wrong with the log, and what its reader did about it."""
-    faults = _faults(track)
+    items = check(track.log).items
+    told = sorted(
+        (item for item in items if item.verdict != "ok"), key=lambda item: list(_VERDICTS).index(item.verdict)
+    )
+    right = [item for item in items if item.verdict == "ok"]
+    faults = sum(item.verdict != "not checked" for item in told)
     notes = "".join(f"<li>{_t(note)}</li>" for note in track.log.notes)
-    parts = ["<section>\n<h2>The log</h2>\n"]
-    parts.append(f'<p class="about">{_t(_streams(track))}</p>')
-    if faults is not None:
-        rows = _records(faults)
-        if rows:
-            parts.append(_record_table(rows))
-        else:
-            parts.append('<p><span class="ok">Nothing wrong was found.</span></p>')
-    if notes:
-        parts.append(f"<p>While reading:</p><ul>{notes}</ul>")
-    parts.append("</section>\n")
-    return "".join(parts)
+    return (
+        '<section>\n<h2>The log</h2>\n<p class="about">'
+        f"{_count(len(track.log), 'row')}."
+        f" <strong>{_count(faults, 'fault') if faults else 'No fault'} found.</strong></p>"
+        + (_item_table(told) if told else "")
+        + (
+            f"<details><summary>{_count(len(right), 'point')} in order</summary>{_item_table(right)}</details>"
+            if right
+            else ""
+        )
+        + (f"<details><summary>While reading</summary><ul>{notes}</ul></details>" if notes else "")
+        + "</section>\n"
+    )
 
 
-def _streams(track: Track) -> str:
-    """Name the streams of the log with their rates."""
-    known = [
-        f"{_STREAMS.get(name, name)} at {rate:.3g} Hz" for name, rate in track.log.rates().items() if rate is not None
+def _item_table(items: Iterable[Item]) -> str:
+    """Write the points of a check as a table."""
+    body = [
+        [
+            '<span class="{}">{}</span>'.format(*_VERDICTS[item.verdict]),
+            _t(item.name.replace("_", " ")),
+            _t(item.sentence),
+            f"<code>{_t(item.line)}</code>" if item.line else "",
+        ]
+        for item in items
     ]
-    return f"{_count(len(track.log), 'row')}: {', '.join(known) or 'no stream'}."
-
-
-def _faults(track: Track) -> Any:
-    """Ask `check` what is wrong with the log."""
-    return None
+    used = 4 if any(row[3] for row in body) else 3
+    head = ["verdict", "looked at", "found", "to type"][:used]
+    return _table(head, [row[:used] for row in body], words=range(4))
 
 
 def _benchmark_section(track: Track) -> str:
-    """Show how well the method did on this log's own fixes, hidden and filled again."""
-    if track.benchmark is None:
-        return ""
+    """Show how far off the method was on this log's own fixes, hidden and filled again."""
     rows = _records(track.benchmark)
+    if not rows:
+        return ""
+    known = all({"method", "length_s", "mean_m", "max_m", "coverage"} <= row.keys() for row in rows)
+    table = _outage_table(track, rows) if known else _record_table(rows)
     return (
-        "<section>\n<h2>Outages made in this very log</h2>\n"
-        '<p class="about">Fixes of this log were hidden and filled again; errors are distances to the'
-        f" hidden fixes, so they include the fixes' own errors.</p>{_record_table(rows)}</section>\n"
+        '<section>\n<h2>Outages made in this very log</h2>\n<p class="about">Fixes of this log were hidden and filled'
+        " again. Errors are distances to the hidden fixes, so they include the fixes’ own errors.</p>"
+        f"{table}</section>\n"
+    )
+
+
+def _outage_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Write one line for each length of outage, with the errors of each method side by side."""
+    methods = list(dict.fromkeys(str(row["method"]) for row in rows))
+    methods.sort(key=lambda name: name != track.method)
+    cells = {(str(row["method"]), float(row["length_s"])): row for row in rows}
+    tested = any(row["coverage"] is not None and row["method"] == track.method for row in rows)
+    head = ["outage, s", "starts", *(f"{name}: mean / largest, m" for name in methods)]
+    if tested:
+        head.insert(3, f"inside the {100 * track.level:g} % interval")
+    body = []
+    for length in sorted({length for _, length in cells}):
+        found = [cells.get((name, length)) for name in methods]
+        line = [f"{length:g}", str(next((row["starts"] for row in found if row and "starts" in row), "–"))]
+        line += ["–" if row is None else f"{row['mean_m']:.2f} / {row['max_m']:.2f}" for row in found]
+        if tested:
+            own = cells.get((track.method, length))
+            share = None if own is None else own["coverage"]
+            line.insert(3, "–" if share is None else f"{100 * share:.0f} %")
+        body.append([_t(cell) for cell in line])
+    return _table(
+        [_t(name) for name in head],
+        body,
+        caption="Mean error, and the mean over the starts of the largest error in each outage.",
     )
 
 
 def _tested(track: Track) -> str:
     """Say what hiding this log's own fixes showed about the bound."""
-    return ""
+    rows = [
+        row
+        for row in _records(track.benchmark)
+        if row.get("method") == track.method and row.get("coverage") is not None and row.get("length_s")
+    ]
+    if not rows:
+        return ""
+    weights = [float(row["length_s"]) * float(row.get("starts", 1)) for row in rows]
+    share = sum(w * float(row["coverage"]) for w, row in zip(weights, rows, strict=True)) / sum(weights)
+    low, high = (pick(float(row["length_s"]) for row in rows) for pick in (min, max))
+    lengths = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return (
+        f" Tested on this very log: with its own fixes hidden for {lengths}\u00a0s and filled again,"
+        f" {100 * share:.0f}\u00a0% of them lay inside."
+    )
 
 
 def _records(value: Any) -> list[dict[str, Any]]:
-    """Read a result as rows: a sequence, or something with rows, of mappings or dataclasses."""
-    rows = getattr(value, "rows", value)
-    rows = rows() if callable(rows) else rows
-    records = []
-    for row in rows if isinstance(rows, Iterable) else ():
-        if is_dataclass(row) and not isinstance(row, type):
-            records.append(asdict(row))
-        elif isinstance(row, Mapping):
-            records.append({str(key): item for key, item in row.items()})
-        else:
-            records.append({"": row})
-    return records
+    """Read a result as rows: a sequence of mappings, or something whose `rows` gives one."""
+    rows = value.rows() if hasattr(value, "rows") else value
+    return [{str(key): item for key, item in row.items()} for row in rows or () if isinstance(row, Mapping)]
 
 
 def _record_table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -785,9 +827,11 @@ def _settings_section(track: Track, command: str | None) -> str:
     settings = {"method": track.method, "level": track.level, **track.settings}
     body = [[_t(name.replace("_", " ")), _t(_cell(value))] for name, value in settings.items()]
     again = command if command is not None else _command(track)
+    # an option is not to be broken at its hyphens
+    parts = [f'<span class="nb">{_t(word)}</span>' if word.startswith("-") else _t(word) for word in again.split(" ")]
     return (
         "<section>\n<h2>Make it again</h2>\n"
-        f"<pre><code>{_t(again)}</code></pre>\n"
+        f"<pre><code>{' '.join(parts)}</code></pre>\n"
         f"{_table(['setting', 'value'], body, words=[0, 1])}</section>\n"
     )
 
@@ -805,17 +849,20 @@ def _command(track: Track) -> str:
 def _placing(track: Track, plane: Plane, view: View, charts: Mapping[str, Mapping[str, Any]]) -> str:
     """Write the rules that depend on the track: a strict policy allows no style attributes."""
     rules = [f".map{{aspect-ratio:{view.width / view.height:.4f}}}"]
+    narrow = [f".map{{aspect-ratio:{_NARROW}}}"]
     rules.append(f".bar{{width:{picture.scale_bar(view, plane)[1]:.3f}%}}")
     for number, (x, y) in _pin_places(track, plane).items():
         left, top = view.percent(x, y)
         rules.append(f".p{number}{{left:{left:.2f}%;top:{top:.2f}%}}")
+        lower = 50 + (top - 50) * _NARROW * view.height / view.width
+        narrow.append(f".p{number}{{top:{lower:.2f}%}}")
     for name, chart in charts.items():
         size = chart["high"] - chart["low"]
         for k, (value, _) in enumerate(chart["marks"]):
             rules.append(f".{name}{k}{{bottom:{100 * (value - chart['low']) / size:.2f}%}}")
     for k, (percent, _) in enumerate(_ticks(track)):
         rules.append(f".x{k}{{left:{percent:.2f}%}}")
-    return "".join(rules)
+    return "".join(rules) + f"@media (max-width:620px){{{''.join(narrow)}}}"
 
 
 def _data(

@@ -26,6 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from halfwidth.errors import BadValue, Missing
 from halfwidth.store import atomic_write
+from halfwidth.vehicle.log import COLUMNS as LOG_COLUMNS
+from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.track import COLUMNS, GUARANTEES, Track, runs
 
 Start = datetime | str | float | None
@@ -41,6 +43,9 @@ _DECIMALS = {
     "north_half_m": 4,
     "since_fix_s": 3,
 }
+
+#: Decimals of each column of a log.
+_LOGGED = {**_DECIMALS, "yaw_rate_radps": 6, "ax_mps2": 4, "ay_mps2": 4}
 
 #: Colours of the qualities that a colour-blind reader can tell apart, as red, green, blue.
 COLOURS = {"fix": "0072b2", "bridged": "d55e00", "extrapolated": "882255"}
@@ -92,6 +97,33 @@ def write(
     with atomic_write(name) as file:
         file.write(content)
     return Path(name)
+
+
+def write_log(log: Log, path: "str | os.PathLike[str]") -> Path:
+    """Write a log as CSV with the columns that `halfwidth.vehicle.read` knows, empty where nothing arrived.
+
+    Parameters
+    ----------
+    log : Log
+        What to write.
+    path : str or path
+        Where to; ``-`` is standard output.
+
+    Returns
+    -------
+    Path
+        Where it was written.
+    """
+    columns = [
+        [repr(t) for t in np.round(log.t, 9).tolist()]
+        if column == "t_s"
+        else _texts(getattr(log, name), _LOGGED[column])
+        for column, name in LOG_COLUMNS.items()
+    ]
+    lines = [",".join(LOG_COLUMNS), *map(",".join, zip(*columns, strict=True)), ""]
+    with atomic_write(path) as file:
+        file.write("\n".join(lines).encode())
+    return Path(os.fspath(path))
 
 
 def ending(path: str, format: str | None = None) -> str:  # noqa: A002

@@ -47,9 +47,7 @@ class _Header:
     text: str
 
 
-def read_delimited(
-    source: Source, asked: Mapping[str, str], choose: layout.Chooser = layout.recognise
-) -> Raw:
+def read_delimited(source: Source, asked: Mapping[str, str], choose: layout.Chooser = layout.recognise) -> Raw:
     """Read the columns of a text log.
 
     Parameters

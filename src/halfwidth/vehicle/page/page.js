@@ -14,10 +14,10 @@
   const quality = [];
   for (const [kind, count] of data.q) for (let k = 0; k < count; k++) quality.push(kind);
   const last = t.length - 1;
-  const map = $("map"), frame = $("frame"), slider = $("when"), readout = $("now");
-  const whole = { x: data.view[0], y: data.view[1], w: data.view[2], h: data.view[3] };
-  let view = { ...whole };
-  let span = [t[0], t[last]];
+  const map = $("map"), frame = $("frame"), slider = $("when"), readout = $("now"), tip = $("tip");
+  const drawn = { x: data.view[0], y: data.view[1], w: data.view[2], h: data.view[3] };
+  let whole = drawn, view = drawn;
+  let span = [t[0], Math.max(t[last], t[0] + 1e-6)];
   let current = 0;
 
   // ---- the map: looking closer -------------------------------------------------------------------
@@ -51,6 +51,27 @@
       pin.style.top = `${top}%`;
       pin.classList.toggle("hide", left < 0 || left > 100 || top < 0 || top > 100);
     }
+    drawTip();
+  }
+
+  function drawTip() {
+    const left = (100 * (x[current] - view.x)) / view.w, top = (100 * (y[current] - view.y)) / view.h;
+    tip.classList.toggle("hide", left < 0 || left > 100 || top < 0 || top > 100);
+    tip.classList.toggle("left", left > 65);
+    tip.classList.toggle("above", top > 80);
+    tip.style.left = `${left}%`;
+    tip.style.top = `${top}%`;
+    tip.textContent = `${clock(current).split(" (")[0]} · ± ${Math.max(east[current], north[current]).toFixed(2)} m`;
+  }
+
+  // the whole drive in whatever shape the map has on this screen
+  function fit() {
+    const box = map.getBoundingClientRect();
+    if (!box.width || !box.height) return;
+    const w = Math.max(drawn.w, (drawn.h * box.width) / box.height), h = (w * box.height) / box.width;
+    const same = view === whole;
+    whole = { x: drawn.x + (drawn.w - w) / 2, y: drawn.y + (drawn.h - h) / 2, w, h };
+    if (same) { view = whole; drawMap(); } else look(view);
   }
 
   function look(next) {
@@ -61,7 +82,13 @@
     drawMap();
   }
 
-  function zoom(factor, cx = view.x + view.w / 2, cy = view.y + view.h / 2) {
+  // about the marked place if it is in sight, else about the middle
+  const middle = () => {
+    const dx = x[current] - view.x, dy = y[current] - view.y;
+    return dx > 0 && dx < view.w && dy > 0 && dy < view.h ? [x[current], y[current]] : [view.x + view.w / 2, view.y + view.h / 2];
+  };
+
+  function zoom(factor, cx = middle()[0], cy = middle()[1]) {
     const w = Math.min(Math.max(view.w * factor, 4 / data.unit), 4 * whole.w);
     const real = w / view.w;
     look({ x: cx - (cx - view.x) * real, y: cy - (cy - view.y) * real, w, h: view.h * real });
@@ -91,7 +118,8 @@
   let shown = -1;
 
   function showAll() {
-    look(whole);
+    view = whole;
+    drawMap();
     drawCharts(t[0], t[last]);
     shown = -1;
   }
@@ -131,6 +159,7 @@
     readout.textContent = text;
     slider.value = String(current);
     slider.setAttribute("aria-valuetext", text);
+    drawTip();
     drawNow();
   }
 
@@ -292,5 +321,7 @@
   for (const live of document.querySelectorAll(".live")) live.classList.remove("hide");
   point(data.worst);
   drawMap();
+  fit();
+  new ResizeObserver(fit).observe(map);
   document.documentElement.dataset.ready = "yes";
 })();
