@@ -98,7 +98,7 @@ class Fit:
 
 def solve(
     drives: Sequence[Grid],
-    settings: Chain = Chain(),  # noqa: B008 - a frozen value
+    settings: Chain = Chain(),
     *,
     sigma: Floats | None = None,
     azimuth: Sequence[Floats] | None = None,
@@ -269,7 +269,7 @@ class _Smoothed:
     P: Floats  # (R, 7, 7)
     W: Floats  # (R, 7, 7) expected squares of the state noise, given all fixes
     V: Floats  # (n, 2, 2) their sums of the output noise
-    nV: Floats  # (n,) and counts
+    counted: Floats  # (n,) and counts
     loglik: Floats  # (n,)
     code: NDArray[np.int64]  # (n,)
 
@@ -361,7 +361,7 @@ def _learnt(rows: _Rows, line: _Line, out: _Smoothed, s2: Floats) -> Floats:
         total = np.bincount(rows.drive[keep], np.maximum(squares[keep, g], 0.0), n)
         new[:, g] = (total + s2[:, g]) / (np.bincount(rows.drive[keep], minlength=n) + 1.0)
     V = out.V
-    new[:, 4] = (0.5 * (V[:, 0, 0] + V[:, 1, 1]) + s2[:, 4]) / (out.nV + 1.0)
+    new[:, 4] = (0.5 * (V[:, 0, 0] + V[:, 1, 1]) + s2[:, 4]) / (out.counted + 1.0)
     new = np.where(np.isfinite(new), new, s2)
     return np.clip(new, _FLOOR**2, _CEILING**2)
 
@@ -371,9 +371,7 @@ def _fit(rows: _Rows, out: _Smoothed, s2: Floats, i: int, drive: Grid) -> Fit:
     z, P = out.x[part].copy(), out.P[part]
     z[:, [E, N]] += rows.origin[i]
     east, north = z[:, E] + z[:, OFFSET_E], z[:, N] + z[:, OFFSET_N]
-    variance = np.column_stack(
-        [P[:, a, a] + 2 * P[:, a, o] + P[:, o, o] for a, o in ((E, OFFSET_E), (N, OFFSET_N))]
-    )
+    variance = np.column_stack([P[:, a, a] + 2 * P[:, a, o] + P[:, o, o] for a, o in ((E, OFFSET_E), (N, OFFSET_N))])
     mean = np.concatenate((drive.speed[1:], drive.speed[-1:]))
     speed = z[:, SCALE] * 0.5 * (drive.speed + mean)
     sound = bool(np.isfinite(z).all() and np.isfinite(variance).all() and (variance >= 0).all())

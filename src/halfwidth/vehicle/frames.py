@@ -7,6 +7,7 @@ from north, clockwise, so that forward is (sin azimuth, cos azimuth) and ``d azi
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -148,7 +149,7 @@ def _near(lon_deg: Floats, first: float) -> Floats:
     return first + np.mod(lon_deg - first + 180.0, 360.0) - 180.0
 
 
-def _pymap3d():  # type: ignore[no-untyped-def]  # noqa: ANN202
+def _pymap3d() -> Any:
     try:
         import pymap3d
     except ImportError as error:

@@ -1,10 +1,10 @@
 """The common clock of one drive: fixes as nodes, sensors averaged over the steps between them.
 
 Every estimator of this package works on the same `Grid`. Its nodes are the fixes, thinned to at least 0.19 s apart
-(5 Hz), and, where fixes are further apart than the sensors allow, nodes in between. Speed and yaw rate are averaged over
-each step (their integral by the trapezoid rule, divided by the step), after the sensor clock has been moved by
-`clock_offset`. Where a sensor was silent its mean is an interpolation; `speed_sd` and `yaw_rate_sd` say how wrong that
-may be.
+(5 Hz), and, where fixes are further apart than the sensors allow, nodes in between. Speed and yaw rate are averaged
+over each step (their integral by the trapezoid rule, divided by the step), after the sensor clock has been moved by
+`clock_offset`. Where a sensor was silent its mean is an interpolation; `speed_sd` and `yaw_rate_sd` say how wrong
+that may be.
 """
 
 from bisect import bisect_left
@@ -206,7 +206,9 @@ def _silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
     k = np.searchsorted(clock, middle)
     before, after = clock[np.maximum(k - 1, 0)], clock[np.minimum(k, clock.size - 1)]
     outside = (k == 0) | (k == clock.size)
-    far = np.where(outside, np.abs(middle - np.where(k == 0, after, before)), np.minimum(middle - before, after - middle))
+    far = np.where(
+        outside, np.abs(middle - np.where(k == 0, after, before)), np.minimum(middle - before, after - middle)
+    )
     length = np.where(outside, 2 * far, after - before)
     h = np.concatenate((np.diff(t)[:1], np.diff(t)))
     sd = np.minimum(rate * far, most) * np.sqrt(np.maximum(length / h, 1.0))

@@ -27,7 +27,7 @@ _FAR = 1e6
 
 
 def constant_velocity(
-    dt: float | None = None,
+    dt: ArrayLike | None = None,
     q: Given = None,
     r: Given = None,
     *,
@@ -41,8 +41,8 @@ def constant_velocity(
 
     Parameters
     ----------
-    dt : float, optional
-        Step in seconds; without it every row of a record moves by its own step.
+    dt : float or (T,) array, optional
+        Step in seconds, one for all rows or one a row; without it every row of a record moves by its own step.
     q : (4,) half-widths, a noise, or None
         Noise of the state; numbers are half-widths of uniform noise, None is uniform noise of unknown half-widths.
     r : (2,) half-widths, a noise, or None
@@ -73,11 +73,11 @@ def constant_velocity(
             "y": ("east", "north"),
             "u": ("east_acceleration", "north_acceleration") if acceleration else (),
         },
-        dt=1.0 if dt is None else dt,
+        dt=1.0 if dt is None else float(np.ravel(dt)[0]),
     )
 
 
-def gps_ins(dt: float | None = None, q: Given = None, r: Given = None, *, x0: Prior | None = None) -> Linear:
+def gps_ins(dt: ArrayLike | None = None, q: Given = None, r: Given = None, *, x0: Prior | None = None) -> Linear:
     """Return the GPS/INS model of Pavelková (2011): `constant_velocity` with unknown half-widths.
 
     Parameters
@@ -238,19 +238,27 @@ def displacement(azimuth: ArrayLike, speed: ArrayLike, dt: ArrayLike, *, euler: 
     return moved
 
 
-def _cv_motion(dt: float) -> Floats:
-    A = np.eye(4)
-    A[0, 2] = A[1, 3] = dt
+def _cv_motion(dt: ArrayLike) -> Floats:
+    """Return A, (4, 4) or (T, 4, 4)."""
+    h = np.asarray(dt, float)
+    A = np.zeros((*h.shape, 4, 4))
+    A[..., range(4), range(4)] = 1.0
+    A[..., 0, 2] = A[..., 1, 3] = h
     return A
 
 
-def _cv_push(dt: float) -> Floats:
-    return np.vstack((0.5 * dt**2 * np.eye(2), dt * np.eye(2)))
+def _cv_push(dt: ArrayLike) -> Floats:
+    """Return B, (4, 2) or (T, 4, 2)."""
+    h = np.asarray(dt, float)
+    B = np.zeros((*h.shape, 4, 2))
+    B[..., 0, 0] = B[..., 1, 1] = 0.5 * h**2
+    B[..., 2, 0] = B[..., 3, 1] = h
+    return B
 
 
-def _stepped(function: Callable[[float], Floats], dt: float | None) -> Any:
-    """Return the matrix of one step, or the function of the step that a model calls row by row."""
-    return function if dt is None else function(dt)
+def _stepped(function: Callable[[ArrayLike], Floats], dt: ArrayLike | None) -> Any:
+    """Return the matrices of these steps, or the function of the step that a model calls row by row."""
+    return (lambda dt: function(dt)) if dt is None else function(dt)
 
 
 def _noise(given: Given) -> Uniform | Gaussian | Mixed:
