@@ -141,10 +141,10 @@ def fill(
     if output == "-" and report == "-":
         raise _usage("`-o` and `--report` both claim standard output", "--report FILE")
     _method_known(method)
-    if output is not None:
-        _ending_known(output, format_)
     for path in (output, report):
         _writable(path, log, force)
+    if output is not None:
+        _ending_known(output, format_)
     job = Job("fill", log, method=method, level=level, settings={"clock_offset": clock_offset},
               columns=parse_columns(columns or ""))  # fmt: skip
     if dry_run:
