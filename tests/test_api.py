@@ -30,3 +30,9 @@ def test_importing_loads_no_optional_library():
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+def test_functions_keep_their_names_whatever_was_imported_first():
+    code = "import halfwidth.estimate, halfwidth.learn, halfwidth.score, halfwidth as hw; print(callable(hw.estimate), callable(hw.learn))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["True", "True"]

@@ -8,6 +8,8 @@ the user. NaN in y is a missing entry.
 """
 
 import importlib
+import sys
+import types
 from typing import TYPE_CHECKING, Any
 
 from halfwidth.methods import ESTIMATORS
@@ -95,3 +97,15 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return list(__all__)
+
+
+class _Package(types.ModuleType):
+    """The package: a public function keeps its name although the module that holds it is called the same."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # The import system binds every submodule it loads to the package; `halfwidth.learn` must stay the function.
+        if not (name in _HOME and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
