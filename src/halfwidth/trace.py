@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Tape", "Untraceable", "trace"]
+__all__ = ["Tape", "Untraceable", "compiled", "trace"]
 
 _TURNED = (
     "a traced value was turned into a plain number; write `np.sin` rather than `math.sin`, and build arrays with "
@@ -155,6 +155,21 @@ def trace(f: Callable[..., Any], sizes: Sequence[int | None]) -> Tape:
         raise Untraceable("it returns nothing")
     widths = tuple(1 if n is None else n for n in sizes)
     return record.tape(slots, widths)
+
+
+def compiled(f: Callable[..., Any], sizes: Sequence[int | None], points: Iterable[tuple[Any, ...]]) -> Tape:
+    """Record `f` and compare the tape with it at `points`.
+
+    Raises
+    ------
+    Untraceable
+        If `f` cannot be recorded, or gives something else than its tape: it is random, keeps state, or is not finite
+        at any of the points.
+    """
+    tape = trace(f, sizes)
+    if not tape.agrees(f, points):
+        raise Untraceable("what was recorded gives other values than the function itself; is it random, or does it count?")
+    return tape
 
 
 def _called(arguments: Sequence[Any], sizes: Sequence[int]) -> list[Any]:

@@ -4,7 +4,11 @@ import importlib
 from typing import Any
 
 #: Exported estimators and the module of each; loaded when first used.
-ESTIMATORS: dict[str, str] = {}
+ESTIMATORS: dict[str, str] = {
+    "ExtendedKalman": "nonlinear",
+    "UnscentedKalman": "nonlinear",
+    "ParticleFilter": "particle",
+}
 
 
 def load(name: str) -> Any:
