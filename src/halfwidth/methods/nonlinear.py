@@ -21,7 +21,7 @@ import numpy as np
 from halfwidth import methods
 from halfwidth.array import Array
 from halfwidth.derivative import differences
-from halfwidth.errors import BadShape, BadValue
+from halfwidth.errors import BadShape, BadValue, Refused, hinted
 from halfwidth.methods._deviations import Function, Spread, scan
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear, arity
@@ -430,15 +430,14 @@ def _judged(found: dict[str, Any], t: Array) -> tuple[Status, str | None]:
 
 
 def _init(method: Method, model: Model) -> Belief:
-    if isinstance(model, Linear):
-        raise BadValue(
-            f"`{type(method).__name__}` was asked to stream a linear model", hint="stream(model, KalmanFilter())"
-        )
     reason = method.refuses(model)
     if reason is not None:
-        raise BadValue(reason)
+        message, hint = hinted(reason)
+        raise Refused(message, hint=hint)
     prior = model.x0
     assert isinstance(prior, Normal)
+    if isinstance(model, Linear):
+        return Belief(prior.mean, prior.P, 0.0, None, None)
     u = np.zeros((1, model.nu)) if model.nu else None
     rows = _rows(model, np.zeros(1), np.full(1, model.dt), np.full((1, model.ny), np.nan), u)
     tapes, _ = _tapes(model, rows, exact=isinstance(method, ExtendedKalman), wanted=method.compiled)
@@ -448,10 +447,26 @@ def _init(method: Method, model: Model) -> Belief:
 def _step(
     model: Model, state: Belief, y: Array, u: Array | None, t: float, dt: float, spread: Spread, iterations: int
 ) -> Belief:
-    assert isinstance(model, Nonlinear)
     outputs = np.asarray(y, dtype=np.float64).reshape(1, model.ny)
     inputs = None if u is None else np.asarray(u, dtype=np.float64).reshape(1, model.nu)
-    rows = _rows(model, np.array([t]), np.array([dt]), outputs, inputs)
-    tapes = None if state.g is None or state.h is None else (state.g, state.h)
-    found = _pass(model, rows, tapes, state.x, state.P, spread, iterations, None, smooth=False)
+    if isinstance(model, Linear):
+        found = _linear_row(model, state, outputs, inputs, t, dt)
+    else:
+        rows = _rows(model, np.array([t]), np.array([dt]), outputs, inputs)
+        tapes = None if state.g is None or state.h is None else (state.g, state.h)
+        found = _pass(model, rows, tapes, state.x, state.P, spread, iterations, None, smooth=False)
     return Belief(found["x"][0], found["P"][0], state.loglik + float(found["loglik"][0]), state.g, state.h)
+
+
+def _linear_row(model: Linear, state: Belief, y: Array, u: Array | None, t: float, dt: float) -> dict[str, Any]:
+    """One row of a linear model, E and F folded into the other matrices."""
+    at = {name: matrix.at(t, dt) for name, matrix in model.matrices.items()}
+    E = np.linalg.inv(at["E"]) if "E" in at else np.eye(model.nx)
+    F = np.linalg.inv(at["F"]) if "F" in at else np.eye(model.ny)
+    A, C = E @ at["A"], F @ at["C"]
+    shift = np.zeros(model.nx) if u is None else E @ at["B"] @ u[0]
+    Q, R = E @ model.w.cov().at(t, dt) @ E.T, F @ model.e.cov().at(t, dt) @ F.T
+    g = Function(lambda x, _: A @ x + shift, lambda *_: A, np.zeros(model.nx, bool))
+    h = Function(lambda x, _: C @ x, lambda *_: C, np.zeros(model.ny, bool))
+    exact = Spread(0.0, 0.0, 0.0)
+    return scan(g, h, lambda _: Q, lambda _: R, state.x, state.P, y, ~np.isnan(y), exact)
