@@ -1,8 +1,8 @@
 """The Kalman kernels against their naive twins: random models, masks, degenerate sizes, singular matrices."""
 
-import naive
 import numpy as np
 import pytest
+from tests import naive
 
 from halfwidth import _core
 
