@@ -3,7 +3,9 @@
 ``x[t] = g(x[t-1], u[t]) + w[t]``,  ``y[t] = h(x[t]) + e[t]``. The extended filter linearises g and h at the estimate [1]_;
 the unscented filter carries sigma points through them [2]_. With ``smooth=True`` a Rauch-Tung-Striebel pass uses the
 whole record. ``g`` and ``h`` are recorded once a run and then run compiled, the whole record in C++; where that is not
-possible the same algorithm runs in NumPy. ``info["evaluated"]`` says which, ``info["reason"]`` why.
+possible the same algorithm runs in NumPy. ``info["evaluated"]`` says which, ``info["reason"]`` why; ``info["nis"]`` is the
+normalised square of each row's innovation, ``info["x0"]`` and ``info["P0"]`` the smoothed state one step before the first
+row.
 
 References
 ----------
@@ -235,7 +237,7 @@ def _run(method: Method, model: Model, record: Record, spread: Spread, iteration
     info: dict[str, Any] = {"evaluated": "python" if tapes is None else "compiled", "iterations": rounds}
     info |= {"nis": found["nis"], "message": message, "reason": reason}
     if method.smooth:
-        info["x0"] = Normal.of(found["x0"], found["P0"])
+        info |= {"x0": found["x0"], "P0": found["P0"]}
     return Estimate(
         record.t,
         found["x"],
