@@ -282,7 +282,7 @@ def test_page_of_6000_points_is_small_and_quick():
 @pytest.mark.parametrize("many", ["rows", "gaps"])
 def test_page_of_a_huge_track_is_bounded(many):
     if many == "rows":
-        track = simulated(100_000)
+        track = simulated(40_000)
     else:
         track = made_track(60_000, outages=tuple((10 * k + 5, 10 * k + 8) for k in range(5900)))
     text = page(track)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 #: Public names and the module of each, loaded when first used.
 _HOME: dict[str, str] = {
     "Check": "check",
+    "Gap": "track",
     "Limits": "formats",
     "Log": "log",
     "Track": "track",
@@ -20,6 +21,7 @@ _HOME: dict[str, str] = {
     "from_frame": "formats",
     "outages": "outage",
     "read": "formats",
+    "simulate_drive": "drive",
 }
 
 __all__ = sorted(_HOME)
@@ -27,12 +29,14 @@ __all__ = sorted(_HOME)
 if TYPE_CHECKING:
     from halfwidth.vehicle.check import Check as Check
     from halfwidth.vehicle.check import check as check
+    from halfwidth.vehicle.drive import simulate_drive as simulate_drive
     from halfwidth.vehicle.fill import fill as fill
     from halfwidth.vehicle.formats import Limits as Limits
     from halfwidth.vehicle.formats import from_frame as from_frame
     from halfwidth.vehicle.formats import read as read
     from halfwidth.vehicle.log import Log as Log
     from halfwidth.vehicle.outage import outages as outages
+    from halfwidth.vehicle.track import Gap as Gap
     from halfwidth.vehicle.track import Track as Track
 
 
