@@ -49,7 +49,7 @@ def main() -> None:
         log, track, report = (str(Path(folder) / name) for name in ("drive.csv", "track.gpx", "report.html"))
         subprocess.run([python, "-m", "halfwidth", "demo", "-o", folder, "--force", "-q"], check=True,
                        stdout=subprocess.DEVNULL)  # fmt: skip
-        fill = [python, "-m", "halfwidth", "fill", log, "-o", track, "--report", report, "--force", "-q"]
+        fill = [python, "-m", "halfwidth", "fill", log, "-o", track, "--force", "-q"]
         rows = [
             ("python -c pass", [python, "-c", "pass"], None, None),
             ("import numpy", [python, "-c", "import numpy"], None, None),
@@ -58,8 +58,8 @@ def main() -> None:
              None, None),
             ("halfwidth --help", [python, "-m", "halfwidth", "--help"], 0.4, None),
             ("halfwidth check, 10 min 10 Hz", [python, "-m", "halfwidth", "check", log], None, None),
-            ("halfwidth fill, 10 min 10 Hz", fill[:-5] + ["--force", "-q"], None, None),
-            ("the same with a report", fill, 3.0, 350.0),
+            ("halfwidth fill, 10 min 10 Hz", fill, None, None),
+            ("the same with a report", [*fill, "--report", report], 3.0, 350.0),
         ]  # fmt: skip
         print(f"{'':32}{'wall s':>8}{'CPU s':>8}{'MB':>8}   promised")
         for name, args, most_s, most_mb in rows:
