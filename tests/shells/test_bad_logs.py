@@ -134,7 +134,7 @@ def plain():
 
 
 def bomb():
-    return b"t_s,lat_deg,lon_deg\n" + b"0,0,0\n" * 2_000_000
+    return b"t_s,lat_deg,lon_deg\n" + b"0,0,0\n" * 1_000_000
 
 
 def twice(folder):
