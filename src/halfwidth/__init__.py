@@ -27,6 +27,7 @@ _HOME: dict[str, str] = {
     "Record": "record",
     "Estimate": "result",
     "Status": "result",
+    "from_continuous": "continuous",
     "estimate": "estimate",
     "simulate": "simulate",
     "score": "score",
@@ -51,6 +52,7 @@ _HOME: dict[str, str] = {
 __all__ = ["__version__", *sorted(_HOME)]
 
 if TYPE_CHECKING:
+    from halfwidth.continuous import from_continuous as from_continuous
     from halfwidth.errors import BadLog as BadLog
     from halfwidth.errors import BadRecord as BadRecord
     from halfwidth.errors import BadShape as BadShape
