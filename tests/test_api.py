@@ -5,46 +5,11 @@ import sys
 
 import halfwidth as hw
 
-    "BadLog",
-    "BadRecord",
-    "BadShape",
-    "BadValue",
-    "Box",
-    "Cloud",
-    "DataQualityWarning",
-    "Estimate",
-    "Estimator",
-    "Gaussian",
-    "HalfwidthError",
-    "KalmanFilter",
-    "KalmanSmoother",
-    "Learned",
-    "Linear",
-    "Missing",
-    "Mixed",
-    "Nonlinear",
-    "Normal",
-    "Record",
-    "Recursive",
-    "Refused",
-    "Status",
-    "Uniform",
-    "Unsolved",
-    "__version__",
-    "estimate",
-    "forecast",
-    "learn",
-    "resume",
-    "score",
-    "simulate",
-    "stream",
-"""
-BadLog BadRecord BadShape BadValue Box Cloud DataQualityWarning Estimate Estimator Gaussian HalfwidthError Linear
-Missing Mixed Nonlinear Normal Record Recursive Refused Status Uniform Unsolved __version__ estimate from_continuous
 NAMES = """
-NAMES = [
-]
-score simulate
+BadLog BadRecord BadShape BadValue Box Cloud DataQualityWarning Estimate Estimator Gaussian HalfwidthError
+KalmanFilter KalmanSmoother Learned Linear Missing Mixed Nonlinear Normal Record Recursive Refused Status Uniform
+Unsolved __version__ estimate forecast from_continuous learn resume score simulate stream
+"""
 
 
 def test_exported_names():
