@@ -29,13 +29,16 @@ def test_linear_gaussian_is_kalman_within_its_own_error(smooth):
     kalman = hw.KalmanSmoother() if smooth else hw.KalmanFilter()
     want = hw.estimate(model, record, kalman)
     runs = [
-        hw.estimate(model, record, ParticleFilter(particles=500, smooth=smooth, trajectories=200), seed=k) for k in range(10)
+        hw.estimate(model, record, ParticleFilter(particles=500, smooth=smooth, trajectories=200), seed=k)
+        for k in range(10)
     ]
     x = np.array([e.x for e in runs])
     error, scatter = x.mean(axis=0) - want.x, x.std(axis=0) / np.sqrt(len(runs))
     assert np.sqrt(np.mean((error / scatter) ** 2)) < 1.8
     assert np.abs(error).max() < 0.15 * np.sqrt(want.P.max())
-    var = np.mean([np.einsum("tn,tni->ti", e.spread.weights, (e.spread.points - e.x[:, None]) ** 2) for e in runs], axis=0)
+    var = np.mean(
+        [np.einsum("tn,tni->ti", e.spread.weights, (e.spread.points - e.x[:, None]) ** 2) for e in runs], axis=0
+    )
     ratio = var / np.diagonal(want.P, axis1=1, axis2=2)
     assert 0.9 < ratio.mean() < 1.1
     # E exp(loglik) is the likelihood itself.
@@ -96,7 +99,9 @@ def test_bounded_scalar_model_equals_dense_quadrature(kind):
     runs = [hw.estimate(model, record, ParticleFilter(particles=3000), seed=k) for k in range(6)]
     x = np.array([r.x[:, 0] for r in runs])
     assert np.abs(x.mean(axis=0) - mean).max() < 0.04 * np.sqrt(var.max())
-    spread = np.mean([np.einsum("tn,tn->t", r.spread.weights, (r.spread.points[..., 0] - r.x) ** 2) for r in runs], axis=0)
+    spread = np.mean(
+        [np.einsum("tn,tn->t", r.spread.weights, (r.spread.points[..., 0] - r.x) ** 2) for r in runs], axis=0
+    )
     np.testing.assert_allclose(spread, var, rtol=0.12)
     # the mean of the likelihoods, not of their logarithms
     assert np.log(np.mean(np.exp([r.loglik - loglik for r in runs]))) == pytest.approx(0.0, abs=0.15)
@@ -108,7 +113,9 @@ def test_bounded_scalar_model_equals_dense_quadrature(kind):
 def test_bounded_outputs_with_a_full_F_and_any_entry_missing():
     """An unseen output between seen ones is drawn: the mean over it equals a long run of rejection."""
     F = [[1.0, 0.8, -0.5], [0.0, 1.0, 0.9], [0.0, 0.0, 1.0]]
-    model = hw.Linear([[1.0]], None, [[1.0], [0.5], [-1.0]], hw.Uniform(1.0), hw.Uniform([0.5, 0.6, 0.7]), hw.Box(0, 0.001), F=F)
+    model = hw.Linear(
+        [[1.0]], None, [[1.0], [0.5], [-1.0]], hw.Uniform(1.0), hw.Uniform([0.5, 0.6, 0.7]), hw.Box(0, 0.001), F=F
+    )
     rng = np.random.default_rng(0)
     n = 400_000
     x = rng.uniform(-1, 1, n)
@@ -159,7 +166,9 @@ def test_angles_are_averaged_on_the_circle():
 
 
 def test_bounds_on_the_state_are_kept():
-    model = hw.Linear([[1.0]], None, [[1.0]], hw.Gaussian(0.5), hw.Gaussian(1.0), hw.Normal([0.5], 0.1), bounds=(0.0, 1.0))
+    model = hw.Linear(
+        [[1.0]], None, [[1.0]], hw.Gaussian(0.5), hw.Gaussian(1.0), hw.Normal([0.5], 0.1), bounds=(0.0, 1.0)
+    )
     record = hw.Record(np.arange(30.0), np.full(30, 3.0))
     for smooth in (False, True):
         est = hw.estimate(model, record, ParticleFilter(smooth=smooth), seed=2)
@@ -227,6 +236,7 @@ def test_no_output_noise(e):
 
 def test_correlated_mixed_noise_draws_its_bounded_part():
     """Nearly diagonal noise, weighted by draws, against the exact weights of diagonal noise."""
+
     def model(c):
         e = hw.Uniform([0.5, 0.3]) + hw.Gaussian([[0.2, c], [c, 0.3]])
         return hw.Linear([[0.9]], None, [[1.0], [1.0]], hw.Gaussian(0.3), e, hw.Normal([0.0], 1.0))
@@ -251,7 +261,11 @@ def test_density_of_the_sum_of_bounded_and_gaussian():
     for r, sd in ((1.0, 0.3), (0.2, 2.0), (1e-5, 1.0), (1.0, 1e-3)):
         for v in (0.0, 0.4 * r, -1.1 * r, r + 3 * sd):
             lo, hi = max(-r, v - 12 * sd), min(r, v + 12 * sd)
-            want = quad(lambda b, v=v, sd=sd: norm.pdf(v - b, scale=sd), lo, hi, epsabs=1e-14)[0] / (2 * r) if lo < hi else 0.0
+            want = (
+                quad(lambda b, v=v, sd=sd: norm.pdf(v - b, scale=sd), lo, hi, epsabs=1e-14)[0] / (2 * r)
+                if lo < hi
+                else 0.0
+            )
             got = np.exp(_log_sum_density(np.array([v]), r, sd, np.zeros(1)))[0]
             assert got == pytest.approx(want, rel=1e-7, abs=1e-12)
     far = _log_sum_density(np.array([1e3, -1e6]), 1.0, 1.0, np.zeros(2))

@@ -1,11 +1,12 @@
 """Bootstrap particle filter and smoother: any model, any noise that can be drawn; slow, and true in the limit.
 
 Particles are moved by the model with noise drawn from it and weighted by the density of what was seen [1]_. Gaussian
-output noise weights with its density, uniform noise keeps or drops, and of mixed noise the bounded part is drawn with the
-particle and the Gaussian part weights, since the expectation of that weight is the density of the sum; where its entries
-are independent that expectation is taken exactly. Independent outputs are taken from the last to the first, ``y_i = C_i x +
-e_i - sum_j>i F_ij y_j``, and an unseen one that matters is drawn, so that any entry may be missing. Weights are logarithms; particles are redrawn (systematically [2]_) when less than half of them count. The
-smoother draws trajectories backwards [3]_.
+output noise weights with its density and uniform noise keeps or drops. Of mixed noise the bounded part is drawn with
+the particle and the Gaussian part weights, since the expectation of that weight is the density of the sum; where its
+entries are independent that expectation is taken exactly. Independent outputs are taken from the last to the first,
+``y_i = C_i x + e_i - sum_j>i F_ij y_j``, and an unseen one that matters is drawn, so that any entry may be missing.
+Weights are logarithms; particles are redrawn, systematically [2]_, when less than half of them count. The smoother
+draws trajectories backwards [3]_.
 
 References
 ----------
@@ -40,8 +41,8 @@ class ParticleFilter:
     """Bootstrap particle filter, or smoother by backward simulation.
 
     The reference for what has no closed form: bounded, Gaussian and mixed noise, bounds on the state, nonlinear models.
-    The error of a mean falls with ``1 / sqrt(particles)``, and particles run out when the outputs are much sharper than the
-    prediction; then the status is COLLAPSED, the row's outputs are passed over, and the message names the time.
+    The error of a mean falls with ``1 / sqrt(particles)``, and particles run out when the outputs are much sharper than
+    the prediction; then the status is COLLAPSED, the row's outputs are passed over, and the message names the time.
 
     Parameters
     ----------
@@ -81,7 +82,9 @@ class ParticleFilter:
         if isinstance(model.x0, Box) and not np.isfinite([model.x0.lo, model.x0.hi]).all():
             return "`ParticleFilter` cannot draw from a prior without ends\nhint: x0=Box(lo, hi) or Normal(mean, P)"
         if isinstance(model, Linear) and model.theta_entries:
-            return "`ParticleFilter` needs a known model but some entries are NaN\nhint: give every entry of A, B, C, E, F"
+            return (
+                "`ParticleFilter` needs a known model but some entries are NaN\nhint: give every entry of A, B, C, E, F"
+            )
         if model.loss is not None:
             return "`ParticleFilter` cannot tell losses from outputs\nhint: RBPF(), or a model without `loss`"
         if self.smooth and not _has_density(model.w):
@@ -94,7 +97,7 @@ class ParticleFilter:
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:
         """Estimate the states; see `halfwidth.estimate`."""
         entropy = np.random.SeedSequence(seed).entropy
-        rng = np.random.default_rng(entropy)  # type: ignore[arg-type]
+        rng = np.random.default_rng(entropy)
         T, N, nx = len(record), self.particles, model.nx
         dt = record.steps(model.dt)
         motion = _motion(model, record, dt, compiled_=self.compiled)
@@ -174,7 +177,8 @@ def _judged(collapsed: list[int], ess: Array, t: Array) -> tuple[Status, str | N
     if collapsed:
         k = collapsed[0]
         return Status.COLLAPSED, (
-            f"no particle explains row {k}, t = {t[k]:.6g} s ({len(collapsed)} of {len(t)} rows); its outputs were passed over"
+            f"no particle explains row {k}, t = {t[k]:.6g} s ({len(collapsed)} of {len(t)} rows); "
+            "its outputs were passed over"
         )
     k = int(np.argmin(ess))
     if ess[k] < 2.0:
@@ -286,12 +290,12 @@ def _nonlinear(model: Nonlinear, record: Record, dt: Array, *, compiled_: bool) 
     rng = np.random.default_rng(0)
     tests = [model.x0.mean + s * sd * rng.standard_normal(model.nx) for s in (0.0, 0.5, 1.0, 1.0, 2.0)]
     try:
-        if not compiled_:
-            raise Untraceable("not wanted")
         sizes = (model.nx, model.nu, None)[: arity(model.g, 3)]
         g = compiled(model.g, sizes, [(x, *more(0)) for x in tests])
         h = compiled(model.h, (model.nx,), [(x,) for x in tests])
     except Untraceable:
+        compiled_ = False
+    if not compiled_:
         return _Motion(
             lambda x, k: np.array([_finite(model.g, (p.copy(), *more(k)), model.nx) for p in x]),
             lambda x, k: np.array([_finite(model.h, (p.copy(),), model.ny) for p in x]),  # noqa: ARG005
