@@ -53,7 +53,7 @@ def factor(S: Array) -> tuple[Array, bool]:
     n = len(S)
     tol = 16.0 * _EPS * (n + 1)
     try:
-        L = np.linalg.cholesky(S)
+        L: Array = np.linalg.cholesky(S).astype(np.float64, copy=False)
     except np.linalg.LinAlgError:
         pass
     else:
@@ -74,8 +74,8 @@ def factor(S: Array) -> tuple[Array, bool]:
 def _solve(L: Array, b: Array) -> tuple[Array, Array]:
     """Return L^-1 b and (L L')^-1 b, zero along vanished pivots."""
     if np.all(np.diag(L) > 0):
-        first = np.linalg.solve(L, b)
-        return first, np.linalg.solve(L.T, first)
+        first: Array = np.linalg.solve(L, b).astype(np.float64, copy=False)
+        return first, np.asarray(np.linalg.solve(L.T, first), dtype=np.float64)
     half = np.array(b, dtype=np.float64)
     n = len(L)
     for i in range(n):
