@@ -4,7 +4,7 @@ import importlib
 from typing import Any
 
 #: Exported estimators and the module of each; loaded when first used.
-ESTIMATORS: dict[str, str] = {}
+ESTIMATORS: dict[str, str] = {"BatchLP": "map"}
 
 
 def load(name: str) -> Any:

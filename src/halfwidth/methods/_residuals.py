@@ -178,8 +178,15 @@ class Reference:
     redundancy: Array
 
 
-def reference(rows: Residuals, model: Linear) -> Reference:
+def reference(rows: Residuals, model: Linear, known: Array) -> Reference:
     """Find the least-squares trajectory and the scale of each group.
+
+    Parameters
+    ----------
+    rows : Residuals
+    model : Linear
+    known : (p,) array
+        Scale of the groups whose noise level is known, 0 for the others.
 
     The variance of a group is the sum of its squared residuals over its redundancy, found in a few rounds of least squares from a
     start that scales with the units of every state and output. The redundancy is the trace of a projection, estimated by one seeded
@@ -188,7 +195,7 @@ def reference(rows: Residuals, model: Linear) -> Reference:
     p = rows.nx + rows.ny
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=rows.b.size)
     count = rows.count
-    sigma = _first_scales(rows, model)
+    sigma = np.where(known > 0, known, _first_scales(rows, model))
     X = np.zeros(rows.M.shape[1])
     share = np.zeros(p)
     for _ in range(_ROUNDS):
@@ -205,7 +212,8 @@ def reference(rows: Residuals, model: Linear) -> Reference:
             left = noise - (rows.M @ solve(noise)) / scale
             share[j] = np.clip(signs[mine] @ left[mine] / count[j], 0.0, 1.0)
         level = np.sqrt(square / np.maximum(share * count, 1.0))
-        sigma = np.where(count > 0, np.maximum(np.where(share > TRACE, level, sigma), 1e-12 * size), sigma)
+        level = np.maximum(np.where(share > TRACE, level, sigma), 1e-12 * size)
+        sigma = np.where((count > 0) & (known == 0), level, sigma)
         sigma = np.where(sigma > 0, sigma, 1.0)
     return Reference(X, sigma, column, share * count)
 
@@ -225,6 +233,7 @@ def _first_scales(rows: Residuals, model: Linear) -> Array:
             if level > 0:
                 sigma[nx + j] = level
                 break
+
     def typical(matrix: Varying | None, n: int) -> Array:
         if matrix is None:
             return np.eye(n)
@@ -233,7 +242,7 @@ def _first_scales(rows: Residuals, model: Linear) -> Array:
 
     inverse = np.linalg.inv(typical(model.E, nx))
     Phi = inverse @ typical(model.A, nx)
-    H = typical(model.C, nx) / sigma[nx:, None]
+    H = typical(model.C, nx) / sigma[nx:, None] * (rows.count[nx:, None] > 0)
     gram, step, keep = np.zeros((nx, nx)), inverse, 1.0
     for _ in range(50):
         gram += keep * (H @ step).T @ (H @ step)

@@ -350,9 +350,7 @@ def _descends(program: Program, ray: Array) -> bool:
     return bool(not stopped and flat and program.c @ ray < -TOLERANCE * (np.abs(program.c) @ np.abs(ray)))
 
 
-def _elastic_proof(
-    program: Program, solvers: Sequence[Solver], notes: list[str]
-) -> _Found | None:
+def _elastic_proof(program: Program, solvers: Sequence[Solver], notes: list[str]) -> _Found | None:
     """Return a Farkas certificate from the least total violation of the rows, or None."""
     import scipy.sparse as sp
 
@@ -467,9 +465,7 @@ class _Scaled:
             found = self._believe(claim, x, z, ray, solver, solvers, notes)
             if found.verdict not in (Verdict.FAILED, Verdict.REDUCED):
                 return found
-            if best.check is None or (
-                found.check is not None and found.check.worst < best.check.worst
-            ):
+            if best.check is None or (found.check is not None and found.check.worst < best.check.worst):
                 best = found
         return best
 
@@ -646,9 +642,7 @@ def highs(*, solver: str = "choose", time_limit: float = 120.0) -> Solver:
             engine.run()
             status = engine.getModelStatus()
         info = engine.getInfo()
-        count = max(
-            0, info.simplex_iteration_count, info.ipm_iteration_count, info.qp_iteration_count
-        )
+        count = max(0, info.simplex_iteration_count, info.ipm_iteration_count, info.qp_iteration_count)
         if status == kind.kInfeasible:
             _, there, ray = engine.getDualRay()
             return Claim(Verdict.INFEASIBLE, z=np.array(ray) if there else None, iterations=count)
