@@ -5,12 +5,13 @@ With X = (x0, x[0], ..., x[T-1]) stacked, the noise that a trajectory needs is `
     E x[t] - A x[t-1] - B u[t]   = w[t]            state rows, group i of the state
     C x[t] - F y[t]              = -e[t]           output rows, group nx + j
 
-A half-width s = (q, r) bounds the rows of its group, ``|M X - b| <= S s``. An unseen output that a seen one is correlated
-with through F is eliminated, so that row's bound is a sum of half-widths: that is the projection of the unseen entry, row by row.
+A half-width s = (q, r) bounds the rows of its group, ``|M X - b| <= S s``. An unseen output that a seen one is
+correlated with through F is eliminated, so that row's bound is a sum of half-widths: that is the projection of the
+unseen entry, row by row.
 
-Beside the rows this module finds what every bounded estimator needs first: a least-squares trajectory to start from, the
-scale sigma of each group (its noise level by Helmert's variance components, so that units do not matter), the groups whose noise leaves no trace in the data
-(redundancy 0), and the directions of the state that no output sees.
+Beside the rows this module finds what every bounded estimator needs first: a least-squares trajectory to start from,
+the scale sigma of each group (its noise level by variance components, so that units do not matter), the groups whose
+noise leaves no trace in the data (redundancy 0), and the directions of the state that no output sees.
 
 References
 ----------
@@ -188,9 +189,9 @@ def reference(rows: Residuals, model: Linear, known: Array) -> Reference:
     known : (p,) array
         Scale of the groups whose noise level is known, 0 for the others.
 
-    The variance of a group is the sum of its squared residuals over its redundancy, found in a few rounds of least squares from a
-    start that scales with the units of every state and output. The redundancy is the trace of a projection, estimated by one seeded
-    draw of signs a group.
+    The variance of a group is the sum of its squared residuals over its redundancy, found in a few rounds of least
+    squares from a start that scales with the units of every state and output. The redundancy is the trace of a
+    projection, estimated by one seeded draw of signs a group.
     """
     p = rows.nx + rows.ny
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=rows.b.size)
@@ -221,8 +222,8 @@ def reference(rows: Residuals, model: Linear, known: Array) -> Reference:
 def _first_scales(rows: Residuals, model: Linear) -> Array:
     """Return a first scale of each group (p,) that follows the unit of its state or output.
 
-    An output's is its typical step from one seen row to the next; a state's is the disturbance that moves the outputs of the
-    next rows by one such step.
+    An output's is its typical step from one seen row to the next; a state's is the disturbance that moves the outputs
+    of the next rows by one such step.
     """
     nx, ny = rows.nx, rows.ny
     sigma = np.ones(nx + ny)
@@ -284,10 +285,10 @@ def _least_squares(rows: Residuals, sigma: Array) -> tuple[Any, Array]:
 
 
 def unseen_directions(rows: Residuals, model: Linear, record: Record) -> Array:
-    """Return the directions of the first state that leave no trace in any seen output, as rows of an orthonormal array (k, nx).
+    """Return the directions of x0 that leave no trace in any seen output, unit vectors as rows (k, nx).
 
-    The undisturbed outputs ``C Phi(t) x0`` of all rows are compressed pairwise, T to T/2 and so on, by QR; each half may be rescaled freely
-    because only the null space counts.
+    The undisturbed outputs ``C Phi(t) x0`` of all rows are compressed pairwise, T to T/2 and so on, by QR; each half
+    may be rescaled freely because only the null space counts.
     """
     T, nx = rows.T, rows.nx
     dt = record.steps(model.dt)
@@ -296,9 +297,9 @@ def unseen_directions(rows: Residuals, model: Linear, record: Record) -> Array:
         stack, index = matrix.stack(record.t, dt)
         return np.broadcast_to(stack, (T, *stack.shape[1:])) if index is None else stack[index]
 
-    Phi = every(model.A)
+    Phi = np.array(every(model.A))
     if model.E is not None:
-        Phi = np.linalg.solve(every(model.E), Phi)
+        Phi = np.array(np.linalg.solve(every(model.E), Phi), dtype=np.float64)
     # Rows of seen outputs with their unseen partners eliminated, straight from the residual matrix.
     C = np.zeros((T, rows.ny, nx))
     outputs = rows.M[T * nx :].tocoo()
@@ -306,12 +307,12 @@ def unseen_directions(rows: Residuals, model: Linear, record: Record) -> Array:
     C[rows.row[T * nx + k], rows.group[T * nx + k] - nx, j % nx] = outputs.data
     unit = np.abs(C).max(axis=(0, 2))
     C = C / np.where(unit > 0, unit, 1.0)[:, None]
-    R = np.linalg.qr(C @ Phi, mode="r") if rows.ny > nx else C @ Phi
+    R = _compressed(C @ Phi)
     while len(Phi) > 1:
         half = len(Phi) // 2
         first, second = slice(0, 2 * half, 2), slice(1, 2 * half, 2)
         both = np.concatenate([_unit(R[first]), _unit(R[second] @ Phi[first])], axis=1)
-        joined = np.linalg.qr(both, mode="r") if both.shape[1] > nx else both
+        joined = _compressed(both)
         forward = _unit(Phi[second] @ Phi[first])
         if len(Phi) % 2:
             joined = np.concatenate([_tall(joined, nx), _tall(R[-1:], nx)])
@@ -322,6 +323,11 @@ def unseen_directions(rows: Residuals, model: Linear, record: Record) -> Array:
     _, value, right = np.linalg.svd(_tall(R, nx)[0] / column)
     lost = right[value <= 1e-9 * max(float(value[0]), 1e-300)] / column
     return np.asarray(lost / np.linalg.norm(lost, axis=1, keepdims=True)) if len(lost) else lost.reshape(0, nx)
+
+
+def _compressed(stack: Array) -> Array:
+    """Reduce tall matrices to as many rows as columns, with the same null space."""
+    return np.asarray(np.linalg.qr(stack, mode="r")) if stack.shape[1] > stack.shape[2] else stack
 
 
 def _unit(stack: Array) -> Array:

@@ -1,22 +1,27 @@
 """BatchLP: states and unknown half-widths of uniform noise at once, by linear programming over a whole record.
 
-The joint posterior of a trajectory and the half-widths s = (q, r) is ``prod_j s_j^(-N_j)`` wherever every residual lies within its half-width and every
-state in its box, and 0 elsewhere; N_j is the number of rows of group j, seen outputs only. With the logarithm linearised, its maximum is the linear program
+The joint posterior of a trajectory and the half-widths s = (q, r) is ``prod_j s_j^(-N_j)`` wherever every residual
+lies within its half-width and every state in its box, and 0 elsewhere; N_j is the number of rows of group j, seen
+outputs only. With the logarithm linearised, its maximum is the linear program
 
     minimise  sum_j c_j s_j     subject to    |E x[t] - A x[t-1] - B u[t]| <= q,   |F y[t] - C x[t]| <= r,
                                               lo <= x[t] <= hi,   floors <= (q, r) <= caps.
 
-Three things are added to the paper. The objective is **scaled**: c_j = N_j / sigma_j with sigma_j the group's noise level in a least-squares fit, so that metres
-and radians can be summed; the paper's plain sum is ``objective="paper"``. The optimum is a **face**, not a point: inside a gap the path is free within the
-bounds that the worst step anywhere has set; by default the trajectory of least squares on that face is returned. And **what cannot be known is said**: half-widths that leave no trace
-in the data, directions of the state that no output sees, and, where bounds contradict the data, the rows that do so and the factor by which all half-widths would have to grow.
+Three things are added to the paper. The objective is **scaled**: c_j = N_j / sigma_j with sigma_j the group's noise
+level in a least-squares fit, so that metres and radians can be summed; the paper's plain sum is
+``objective="paper"``. The optimum is a **face**, not a point:
+inside a gap the path is free within the bounds that the worst step anywhere has set; by default the trajectory of
+least squares on that face is returned. And **what cannot be known is said**: half-widths that leave no trace in the
+data, directions of the state that no output sees, and, where bounds contradict the data, the rows that do so and the
+factor by which all half-widths would have to grow.
 
-The half-widths found are the smallest that explain the data, often exactly 0 for one of them, so they are no bounds of the noise to come: the
-estimate has no spread, and `interval` refuses.
+The half-widths found are the smallest that explain the data, often exactly 0 for one of them, so they are no bounds of
+the noise to come: the estimate has no spread, and `interval` refuses.
 
 References
 ----------
-Pavelková (2011), State estimation with missing data and bounded uncertainty, ÚTIA report 2296: eqs. (12), (15)-(19), algorithm 3.3.
+Pavelková (2011), State estimation with missing data and bounded uncertainty, ÚTIA report 2296: eqs. (12), (15)-(19),
+algorithm 3.3.
 """
 
 import math
@@ -70,20 +75,23 @@ class BatchLP:
     Parameters
     ----------
     objective : {"scaled", "paper", "log"}
-        ``"scaled"``: ``sum N_j s_j / sigma_j`` with N_j rows and scale sigma_j of each group, the same for every choice of units. ``"paper"``:
-        ``sum q + sum r`` as printed, which adds metres to radians. ``"log"``: ``sum N_j log s_j`` by majorise-minimise from the scaled optimum; it needs
-        ``at_least`` above 0 for every unknown half-width, since it has no minimum otherwise.
+        ``"scaled"``: ``sum N_j s_j / sigma_j`` with N_j rows and scale sigma_j of each group, the same for every
+        choice of units. ``"paper"``: ``sum q + sum r`` as printed, which adds metres to radians. ``"log"``: ``sum N_j
+        log s_j`` by majorise-minimise from the scaled optimum; it needs ``at_least`` above 0 for every unknown
+        half-width, since it has no minimum otherwise.
     point : {"least_squares", "optimal"}
-        Which trajectory of the optimal face: that of least squares in units of sigma, inside the optimal half-widths widened by 1e-6 of sigma; or the one the solver happens to return.
+        Which trajectory of the optimal face: that of least squares in units of sigma, inside the optimal half-widths
+        widened by 1e-6 of sigma; or the one the solver happens to return.
     grow_caps : bool
-        Where the caps ``at_most`` of unknown half-widths leave no trajectory, double them until one fits (step 7 of the paper's algorithm);
-        ``info["caps_grown"]`` says how often.
+        Where the caps ``at_most`` of unknown half-widths leave no trajectory, double them until one fits (step 7 of
+        the paper's algorithm); ``info["caps_grown"]`` says how often.
     solver : {"auto", "piqp", "highs"}
         "auto" asks PIQP first and HiGHS where its answer does not pass the check.
 
     Notes
     -----
-    The estimate has ``x``, ``q``, ``r``, no spread (`interval` refuses: minimal half-widths are no guarantee), and in ``info``:
+    The estimate has ``x``, ``q``, ``r``, no spread (`interval` refuses: minimal half-widths are no guarantee), and in
+    ``info``:
 
     ==================  ======================================================================
     x0                  state one step before the first row, (nx,)
@@ -100,7 +108,8 @@ class BatchLP:
     caps_grown          factor on the caps, 1 where they were wide enough
     ==================  ======================================================================
 
-    An infeasible record still gets a trajectory: the one that fits with all half-widths inflated, or else the one of least total excess.
+    An infeasible record still gets a trajectory: the one that fits with all half-widths inflated, or else the one of
+    least total excess.
 
     Raises
     ------
@@ -134,7 +143,10 @@ class BatchLP:
     def refuses(self, model: Model) -> str | None:
         """Return why the model cannot be taken, or None."""
         if not isinstance(model, Linear):
-            return "`BatchLP` needs a linear model but the model is nonlinear\nhint: linearise it, or use a method for nonlinear models"
+            return (
+                "`BatchLP` needs a linear model but the model is nonlinear"
+                "\nhint: linearise it, or use a method for nonlinear models"
+            )
         for name, noise in (("w", model.w), ("e", model.e)):
             if not isinstance(noise, Uniform):
                 kind = type(noise).__name__
@@ -153,8 +165,8 @@ class BatchLP:
             return "`BatchLP` takes lost outputs as NaN in the record but the model has a hidden loss\nhint: loss=None"
         if self.objective == "log" and np.any(_unknown(model) & (_ends(model)[0] <= 0)):
             return (
-                "`BatchLP(objective='log')` needs a floor above 0 for every unknown half-width: the logarithm has no minimum at 0"
-                "\nhint: Uniform.unknown(at_least=..., at_most=...)"
+                "`BatchLP(objective='log')` needs a floor above 0 for every unknown half-width: the logarithm has no"
+                " minimum at 0\nhint: Uniform.unknown(at_least=..., at_most=...)"
             )
         return None
 
@@ -260,7 +272,7 @@ class BatchLP:
             "solver": found.solver,
             "iterations": found.iterations,
             "notes": [],
-            "hint": "widen the bounds, give the worst outputs of info['conflicts'] as missing, or BatchLP(grow_caps=True)",
+            "hint": "BatchLP(grow_caps=True), or make the outputs that info['conflicts'] names missing",
         }
         return self._estimate(model, record, task.clipped(X), None, Status.INFEASIBLE, info)
 
@@ -427,7 +439,8 @@ class _Task:
     def inflation(self, solvers: Sequence[Solver], grow: NDArray[np.bool_]) -> tuple[float | None, Array | None]:
         """Return the least common factor on the half-widths that fits a trajectory, and that trajectory.
 
-        The caps of unknown half-widths grow, and known ones where `grow` says so; half-widths without a cap bound nothing.
+        The caps of unknown half-widths grow, and known ones where `grow` says so; half-widths without a cap bound
+        nothing.
         """
         import scipy.sparse as sp
 
@@ -458,7 +471,7 @@ class _Task:
         return float(found.x[-1]) / unit, self.point(found.x)
 
     def elastic(self, solvers: Sequence[Solver]) -> tuple[Array | None, Array | None]:
-        """Return the least total excess of the rows over their widest bounds, (K,) in units of sigma, and its trajectory."""
+        """Return the least total excess of the rows over their caps, (K,) in units of sigma, and its trajectory."""
         import scipy.sparse as sp
 
         n = self.M.shape[1]
@@ -499,7 +512,7 @@ class _Task:
         return self.base.sigma * np.clip(v[self.M.shape[1] :], self.lowest, self.highest)
 
     def enough(self, X: Array, s: Array) -> Array:
-        """Return half-widths that hold the residuals of X: the largest residual, not below the floor nor above the cap."""
+        """Return half-widths that hold the residuals of X: the largest of each group, between floor and cap."""
         rho = np.abs(self.rows.at(X))
         floor, cap = self.lowest * self.base.sigma, self.highest * self.base.sigma
         if self.S.nnz == self.rho.size:

@@ -619,7 +619,7 @@ def highs(*, solver: str = "choose", time_limit: float = 120.0) -> Solver:
         import highspy
 
         kind = highspy.HighsModelStatus
-        engine = highspy.Highs()
+        engine: Any = highspy.Highs()  # type: ignore[no-untyped-call]
         for option, value in (
             ("output_flag", False),
             ("presolve", "off"),  # it prints on stdout, and decides without a proof
