@@ -44,10 +44,12 @@ from halfwidth.errors import BadShape, BadValue
 TOLERANCE = 1e-7
 REDUCED = 1e-6
 
-# Below this share of the balanced cost scale the objective is compared absolutely.
-_FLOOR = 1e-6
+# Below this share of its own terms, or of the balanced cost scale, the objective is compared absolutely.
+_FLOOR, _TINY = 1e-6, 1e-9
+# A row's violation is judged relative to its terms plus this.
+_SMALL = 1e-4
 # A Farkas certificate excludes every x within this many times the program's own size.
-_REACH = 1e6
+_REACH = 1e12
 
 
 class Verdict(Enum):
@@ -165,7 +167,7 @@ class Check:
     Parameters
     ----------
     primal : float
-        Largest violation of a row or box, relative to 1 + |its value|.
+        Largest violation of a row, relative to 1e-4 + the size of its terms; boxes hold exactly.
     dual : float
         Largest reduced cost of forbidden sign, relative to 1 + the size of its terms.
     gap : float
@@ -297,14 +299,14 @@ def judge(program: Program, x: Array, z: Array) -> tuple[Array, Array, Check]:
         primal = float(0.5 * x @ Px + program.c @ x)
         price = _price(z, program.row_lo, program.row_hi) + _price(d, program.lo, program.hi)
         dual = float(price - 0.5 * x @ Px)
-        unit = max(_FLOOR, program.floor) + abs(primal)
+        unit = max(_TINY, program.floor, _FLOOR * float(np.abs(program.c) @ np.abs(x))) + abs(primal)
         off = abs(primal - dual) + float(broken @ np.abs(z)) + float(wrong @ np.abs(x))
         slack = max(
             _largest_product(z, value, program.row_lo, program.row_hi),
             _largest_product(d, x, program.lo, program.hi),
         )
         check = Check(
-            primal=_largest(broken / (1.0 + np.abs(value))),
+            primal=_largest(broken / (_SMALL + abs(program.G) @ np.abs(x))),
             dual=_largest(wrong / (1.0 + terms)),
             gap=_no_nan(off / unit),
             complementarity=_no_nan(slack / unit),
@@ -333,21 +335,52 @@ def certifies(program: Program, z: Array) -> bool:
     return bool(float(z @ ends) - supply > allowed)
 
 
+def _proof(program: Program, z: Array) -> Array | None:
+    """Return multipliers that certify infeasibility, z itself or z cleaned of its rounding, or None.
+
+    An interior point leaves ``G'z`` a little off 0 where x has no box. The correction of least relative size, found by
+    least squares with the weights z^2, keeps the signs.
+    """
+    import scipy.sparse as sp
+    from scipy.sparse.linalg import splu
+
+    if certifies(program, z):
+        return z
+    z = _signed(program, z)
+    top = _largest(np.abs(z))
+    free = np.flatnonzero(np.isneginf(program.lo) | np.isposinf(program.hi))
+    if not 0.0 < top < np.inf or free.size == 0:
+        return None
+    z = np.where(np.abs(z) > 1e-9 * top, z, 0.0) / top
+    G = program.G[:, free]
+    half = np.isfinite(program.lo[free]) | np.isfinite(program.hi[free])
+    for _ in range(3):
+        v = G.T @ z
+        # A side with a box may be priced: only the part that meets no box has to vanish.
+        allowed = half & (np.where(np.isfinite(program.lo[free]), -v, v) >= 0.0)
+        W = sp.diags_array(z**2)
+        H = sp.csc_matrix(G.T @ W @ G)
+        ridge = 1e-12 * max(float(H.diagonal().max(initial=0.0)), 1e-300)
+        step = splu(sp.csc_matrix(H + ridge * sp.eye(free.size))).solve(np.where(allowed, 0.0, v))
+        z = _signed(program, z - W @ (G @ step))
+        if certifies(program, z):
+            return z
+    return None
+
+
 def _descends(program: Program, ray: Array) -> bool:
     """Say whether the objective falls for ever along a ray that no row or box stops."""
-    top = _largest(np.abs(ray))
-    if not 0.0 < top < np.inf:
+    ray = np.where(np.isfinite(program.lo), np.maximum(ray, 0.0), ray)
+    ray = np.where(np.isfinite(program.hi), np.minimum(ray, 0.0), ray)
+    size = np.abs(ray)
+    if not 0.0 < _largest(size) < np.inf:
         return False
-    ray, tol = ray / top, 1e-9
-    move = program.G @ ray
-    stopped = (
-        np.any(move[np.isfinite(program.row_lo)] < -tol)
-        or np.any(move[np.isfinite(program.row_hi)] > tol)
-        or np.any(ray[np.isfinite(program.lo)] < -tol)
-        or np.any(ray[np.isfinite(program.hi)] > tol)
+    move, rounding = program.G @ ray, 1e-11 * (abs(program.G) @ size)
+    stopped = np.any((move < -rounding) & np.isfinite(program.row_lo)) or np.any(
+        (move > rounding) & np.isfinite(program.row_hi)
     )
-    flat = program.P is None or _largest(np.abs(program.P @ ray)) <= tol
-    return bool(not stopped and flat and program.c @ ray < -TOLERANCE * (np.abs(program.c) @ np.abs(ray)))
+    flat = program.P is None or np.all(np.abs(program.P @ ray) <= 1e-12 * (abs(program.P) @ size))
+    return bool(not stopped and flat and program.c @ ray < -TOLERANCE * (np.abs(program.c) @ size))
 
 
 def _elastic_proof(program: Program, solvers: Sequence[Solver], notes: list[str]) -> _Found | None:
@@ -373,10 +406,10 @@ def _elastic_proof(program: Program, solvers: Sequence[Solver], notes: list[str]
         )
     )
     found = elastic.ask([s for s in solvers if s.balanced], notes)
-    if found.z is None or not certifies(program, elastic.z * found.z):
+    z = None if found.z is None else _proof(program, elastic.z * found.z)
+    if z is None:
         return None
-    z, name = elastic.z * found.z, f"{found.solver}, elastic"
-    return _Found(Verdict.INFEASIBLE, None, z, None, name, found.iterations)
+    return _Found(Verdict.INFEASIBLE, None, z, None, f"{found.solver}, elastic", found.iterations)
 
 
 # --- balancing ------------------------------------------------------------------------------------
@@ -441,7 +474,7 @@ class _Scaled:
             lo / size,
             hi / size,
             None if P is None else P / cost,
-            max(_FLOOR, original.floor / (size * cost)),
+            max(_TINY, original.floor / (size * cost)),
             original.chain,
             Scale(np.ones(row.size), np.ones(col.size)),
         )
@@ -491,8 +524,10 @@ class _Scaled:
             seen = f"its point is off by {check.worst:.1e}"
         else:
             seen = "it gave no usable point"
-        if z is not None and certifies(program, z):
-            return _Found(Verdict.INFEASIBLE, None, z, None, solver.name, count)
+        if z is not None and claim.verdict is not Verdict.OPTIMAL:
+            proof = _proof(program, z)
+            if proof is not None:
+                return _Found(Verdict.INFEASIBLE, None, proof, None, solver.name, count)
         if ray is not None and _descends(program, ray):
             free = _Scaled(replace(program, c=np.zeros_like(program.c), P=None))
             if free.ask(solvers, []).verdict is Verdict.OPTIMAL:
@@ -574,9 +609,9 @@ def _piqp(program: Program) -> Claim:
         P = sp.csc_matrix(program.P[keep][:, keep])
 
     solver = piqp.SparseSolver()
-    solver.settings.eps_abs = 1e-9
+    solver.settings.eps_abs = 1e-10
     solver.settings.eps_rel = 1e-10
-    solver.settings.eps_duality_gap_abs = 1e-2 * TOLERANCE * max(_FLOOR, program.floor)
+    solver.settings.eps_duality_gap_abs = 1e-2 * TOLERANCE * max(_TINY, program.floor)
     solver.settings.eps_duality_gap_rel = 1e-10
     solver.setup(
         P,
@@ -628,6 +663,7 @@ def highs(*, solver: str = "choose", time_limit: float = 120.0) -> Solver:
             ("time_limit", float(time_limit)),
             ("primal_feasibility_tolerance", 1e-9),
             ("dual_feasibility_tolerance", 1e-9),
+            ("qp_regularization_value", 1e-10),
         ):
             engine.setOptionValue(option, value)
         engine.passModel(_highs_model(program))
