@@ -214,9 +214,7 @@ def test_disk_that_fills_up_while_writing(target, monkeypatch):
 
 def test_file_size_limit(target):
     """A real limit of the kernel, in a process of its own."""
-    code = (
-        LOAD + "with store.atomic_write(sys.argv[1]) as file:\n    file.write(bytes(1_000_000))\n"
-    )
+    code = LOAD + "with store.atomic_write(sys.argv[1]) as file:\n    file.write(bytes(1_000_000))\n"
     run = subprocess.run(
         [sys.executable, "-S", "-c", code, str(target)],
         capture_output=True,
@@ -338,9 +336,7 @@ def test_kill_9_at_50_instants_leaves_a_whole_file(tmp_path):
     dead = 0
     for _ in range(50):
         target.write_bytes(hashlib.sha256(OLD).digest() + OLD)
-        writer = subprocess.Popen(
-            [sys.executable, "-S", "-c", WRITER, str(target)], stdout=subprocess.PIPE
-        )
+        writer = subprocess.Popen([sys.executable, "-S", "-c", WRITER, str(target)], stdout=subprocess.PIPE)
         writer.stdout.readline()
         time.sleep(rng.uniform(0, 0.015))
         writer.send_signal(signal.SIGKILL)

@@ -18,12 +18,12 @@ def real(value: ArrayLike | None, name: str, *, error: Kind = BadValue, missing:
     None, masked entries and NaN are missing. Complex numbers, text and ragged lists are refused by name.
     """
     if isinstance(value, np.ma.MaskedArray):
-        value = np.ma.filled(value.astype(object), None) if value.dtype.kind in "biu" else value
-        value = value.filled(np.nan) if isinstance(value, np.ma.MaskedArray) else value
+        mask, value = np.ma.getmaskarray(value), np.ma.getdata(value).astype(object)
+        value[mask] = None
     try:
         given = np.asarray(value)
-    except ValueError as exc:
-        raise BadShape(f"`{name}` is ragged: {exc}") from None
+    except ValueError:
+        raise BadShape(f"`{name}` is ragged: its rows differ in length, a rectangle was expected") from None
     if given.dtype.kind == "O":
         try:
             given = np.array([_number(v) for v in given.ravel()]).reshape(given.shape)

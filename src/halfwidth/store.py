@@ -28,13 +28,9 @@ _NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM)
 
 
 @overload
-def atomic_write(
-    path: "str | os.PathLike[str]", mode: Literal["wb"] = "wb"
-) -> AbstractContextManager[BinaryIO]: ...
+def atomic_write(path: "str | os.PathLike[str]", mode: Literal["wb"] = "wb") -> AbstractContextManager[BinaryIO]: ...
 @overload
-def atomic_write(
-    path: "str | os.PathLike[str]", mode: Literal["w"]
-) -> AbstractContextManager[TextIO]: ...
+def atomic_write(path: "str | os.PathLike[str]", mode: Literal["w"]) -> AbstractContextManager[TextIO]: ...
 def atomic_write(path: "str | os.PathLike[str]", mode: str = "wb") -> Any:
     """Open a file that appears under its name only when it is complete.
 

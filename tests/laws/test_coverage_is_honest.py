@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from tests.cases import CASES, METHODS, holes
 
 import halfwidth as hw
-from tests.conftest import CASES, METHODS, holes
 
 MODELS = [c for c in CASES if c.name in ("cv", "oscillator", "walk", "turn", "oscillator uniform", "oscillator mixed")]
 KNOWN = [(m, c) for m in METHODS for c in MODELS if m.refuses(c.model) is None]
@@ -15,7 +15,9 @@ def test_coverage(method, case):
     level, runs = 0.9, 60
     hits = []
     for seed in range(runs):
-        truth, record = hw.simulate(case.model, case.record.u, T=30 if case.record.u is None else None, seed=1000 + seed)
+        truth, record = hw.simulate(
+            case.model, case.record.u, T=30 if case.record.u is None else None, seed=1000 + seed
+        )
         est = hw.estimate(case.model, holes(record, seed, 0.3), method, seed=seed)
         if est.spread is None:
             pytest.skip("a point without a spread")

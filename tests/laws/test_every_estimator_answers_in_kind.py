@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from tests.cases import CASES, IDS, METHODS, PAIRS
 
 import halfwidth as hw
-from tests.conftest import CASES, IDS, METHODS, PAIRS
 
 
 @pytest.mark.parametrize(("method", "case"), PAIRS, ids=IDS)

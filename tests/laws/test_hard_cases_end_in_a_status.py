@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tests.cases import PAIRS
 
 import halfwidth as hw
-from tests.conftest import PAIRS
 
 
 def hard(case):

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from tests.cases import PAIRS, stochastic
 
 import halfwidth as hw
-from tests.conftest import PAIRS, stochastic
 
 SPREAD = [
-    (m, c) for m, c in PAIRS if isinstance(c.model, hw.Linear) and not stochastic(m) and c.model.w.known and c.model.e.known
+    (m, c)
+    for m, c in PAIRS
+    if isinstance(c.model, hw.Linear) and not stochastic(m) and c.model.w.known and c.model.e.known
 ]
 
 

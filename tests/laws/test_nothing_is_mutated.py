@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from tests.cases import IDS, PAIRS
 
 import halfwidth as hw
-from tests.conftest import IDS, PAIRS
 
 
 @pytest.mark.parametrize(("method", "case"), PAIRS, ids=IDS)

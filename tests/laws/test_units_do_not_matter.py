@@ -4,13 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tests.cases import PAIRS, stochastic
 
 import halfwidth as hw
-from tests.conftest import PAIRS, stochastic
 
-LINEAR = [
-    (m, c) for m, c in PAIRS if isinstance(c.model, hw.Linear) and c.model.A.constant and not stochastic(m)
-]
+LINEAR = [(m, c) for m, c in PAIRS if isinstance(c.model, hw.Linear) and c.model.A.constant and not stochastic(m)]
 
 
 @pytest.mark.parametrize(("method", "case"), LINEAR, ids=str)

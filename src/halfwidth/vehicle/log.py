@@ -121,11 +121,7 @@ class Log:
         object.__setattr__(self, "t", t)
         for name in STREAMS:
             given = getattr(self, name)
-            values = (
-                _frozen(name, np.full(t.size, np.nan))
-                if np.size(given) == 0
-                else _frozen(name, given)
-            )
+            values = _frozen(name, np.full(t.size, np.nan)) if np.size(given) == 0 else _frozen(name, given)
             if values.shape != t.shape:
                 raise BadShape(
                     f"`{name}` has {values.size} rows but `t` has {t.size}, one value a row (NaN"
@@ -137,9 +133,7 @@ class Log:
             object.__setattr__(self, name, values)
         if not np.array_equal(np.isnan(self.lat_deg), np.isnan(self.lon_deg)):
             row = int(np.flatnonzero(np.isnan(self.lat_deg) != np.isnan(self.lon_deg))[0])
-            raise BadValue(
-                f"row {row} has only one of `lat_deg` and `lon_deg`, both or neither are expected"
-            )
+            raise BadValue(f"row {row} has only one of `lat_deg` and `lon_deg`, both or neither are expected")
         for name, limit in (("lat_deg", 90.0), ("lon_deg", 360.0)):
             wrong = np.abs(getattr(self, name)) > limit
             if wrong.any():
@@ -218,9 +212,7 @@ class Log:
         if not t0 <= t1:
             raise BadValue(f"`t0` is {t0} s and `t1` is {t1} s, t0 <= t1 is expected")
         inside = (self.t >= t0) & (self.t <= t1)
-        blank: dict[str, Any] = {
-            name: np.where(inside, np.nan, getattr(self, name)) for name in _FIX
-        }
+        blank: dict[str, Any] = {name: np.where(inside, np.nan, getattr(self, name)) for name in _FIX}
         return replace(self, **blank)
 
     def gaps(self) -> list[tuple[float, float]]:
@@ -290,9 +282,7 @@ def to_frame(columns: Mapping[str, Any], native: str) -> Any:
     try:
         library = import_module(native)
     except ImportError as error:
-        raise Missing(
-            f"`native` is {native!r} but {native} is not installed\nhint: pip install {native}"
-        ) from error
+        raise Missing(f"`native` is {native!r} but {native} is not installed\nhint: pip install {native}") from error
     table = {name: np.array(values) for name, values in columns.items()}
     return library.table(table) if native == "pyarrow" else library.DataFrame(table)
 

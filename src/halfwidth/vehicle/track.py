@@ -172,27 +172,19 @@ class Track:
             raise BadShape(f"`quality` has shape {quality.shape} but `t_s` has {t.size} rows")
         strange = ~np.isin(quality, QUALITIES)
         if strange.any():
-            raise BadValue(
-                f"`quality` holds {str(quality[strange][0])!r}, one of {', '.join(QUALITIES)} is"
-                " expected"
-            )
+            raise BadValue(f"`quality` holds {str(quality[strange][0])!r}, one of {', '.join(QUALITIES)} is expected")
         quality.setflags(write=False)
         object.__setattr__(self, "quality", quality)
         for name in ("east_half_m", "north_half_m"):
             if (getattr(self, name) < 0).any():
                 row = int(np.flatnonzero(getattr(self, name) < 0)[0])
                 raise BadValue(
-                    f"`{name}` is {getattr(self, name)[row]:.6g} m in row {row}, a half-width is"
-                    " not negative"
+                    f"`{name}` is {getattr(self, name)[row]:.6g} m in row {row}, a half-width is not negative"
                 )
         if not 0 < self.level < 1:
-            raise BadValue(
-                f"`level` is {self.level}, a probability between 0 and 1 is expected\nhint: 0.9"
-            )
+            raise BadValue(f"`level` is {self.level}, a probability between 0 and 1 is expected\nhint: 0.9")
         if self.guarantee not in GUARANTEES:
-            raise BadValue(
-                f"`guarantee` is {self.guarantee!r}, one of {', '.join(GUARANTEES)} is expected"
-            )
+            raise BadValue(f"`guarantee` is {self.guarantee!r}, one of {', '.join(GUARANTEES)} is expected")
         object.__setattr__(self, "gaps", tuple(self.gaps))
         object.__setattr__(self, "messages", tuple(str(message) for message in self.messages))
         object.__setattr__(self, "settings", MappingProxyType(dict(self.settings)))
