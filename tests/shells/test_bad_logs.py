@@ -11,9 +11,9 @@ import time
 
 import numpy as np
 import pytest
+from tests.vehicle.drives import drive, save, text
 
 from halfwidth.shells import cli
-from tests.vehicle.drives import drive, save, text
 
 GOOD, USAGE, BAD, LIMIT = 0, 2, 3, 6
 

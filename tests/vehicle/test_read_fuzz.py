@@ -9,9 +9,9 @@ import warnings
 
 import numpy as np
 import pytest
+from tests.vehicle.drives import drive, text
 
 import halfwidth as hw
-from tests.vehicle.drives import drive, text
 
 PLAIN = text(drive(120, dt=0.2)).encode()
 TOKENS = [
@@ -77,14 +77,14 @@ def test_mutated_text(packed, tmp_path):
             warnings.simplefilter("error")
             try:
                 log = hw.vehicle.read(path)
-                sane(log)
-                if k % 4 == 0:
-                    hw.vehicle.check(log).to_dict()
-                    sane(hw.vehicle.read(path, repair=False))
-                outcomes["log"] += 1
-            except hw.BadLog as error:
-                assert str(error)
+            except hw.BadLog:
                 outcomes["refused"] += 1
+                continue
+            sane(log)
+            if k % 4 == 0:
+                hw.vehicle.check(log).to_dict()
+                sane(hw.vehicle.read(path, repair=False))
+            outcomes["log"] += 1
     assert min(outcomes.values()) > 20, outcomes
 
 
