@@ -14,7 +14,8 @@
 //
 // Singular systems. S = C P C' + R or P_p = A P A' + Q may be singular (R = 0, Q = 0, P0 = 0). A direction whose pivot
 // is only rounding noise is left out (small.hpp): an output without any variance cannot move the state. Such rows count as
-// `reduced`; when the output contradicts its certain prediction (beyond 1e-6 of its size) the code is `contradicted`.
+// `reduced`; when the output contradicts a certain prediction (beyond 1e-6 of its size) or an uncertain one (beyond a
+// million standard deviations) the code is `contradicted`.
 // When a belief leaves the range of floating point the pass stops: the rows from there on repeat the last finite belief
 // and the code is `broken`. No output is ever NaN.
 //
@@ -183,8 +184,8 @@ struct Correction {
         mul<Op::add>(ny, nx, ny, CP, ct, S);
         const int vanished = ldl(ny, S, L, d, di);
 
-        int code = kalman_ok;
-        if (vanished) code = vanished < 0 ? kalman_broken : kalman_reduced;
+        // A negative pivot is rounding of a belief already certain: left out as well. Overflow shows in x and P.
+        int code = vanished ? kalman_reduced : kalman_ok;
         double quad = 0.0, det = 0.0;
         for (int i = 0; i < ny; i++) {
             double s = v[i];
@@ -200,6 +201,7 @@ struct Correction {
                 if (std::fabs(s) > 1e-6 * size) code = kalman_contradicted;
             }
         }
+        if (quad > 1e12) code = kalman_contradicted;
         if (k < ny) {  // the unit pivots of unseen entries are no data
             n_used -= ny - k;
             if (ll) det -= (ny - k) * log_2pi;

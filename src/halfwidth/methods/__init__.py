@@ -4,7 +4,13 @@ import importlib
 from typing import Any
 
 #: Exported estimators and the module of each; loaded when first used.
-ESTIMATORS: dict[str, str] = {}
+ESTIMATORS: dict[str, str] = {
+    "KalmanFilter": "kalman",
+    "KalmanSmoother": "kalman",
+    "ExtendedKalman": "nonlinear",
+    "UnscentedKalman": "nonlinear",
+    "ParticleFilter": "particle",
+}
 
 
 def load(name: str) -> Any:
