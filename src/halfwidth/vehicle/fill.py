@@ -3,8 +3,13 @@
 The log is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
 gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened by what
 hiding the log's own fixes shows (`calibrate`). A method that fails on a piece is replaced by a simpler one there, and
-the track says so. Positions are those that the receiver would have reported: an error that the receiver carries along
-for minutes is in the fixes on both sides of a gap and in the filling between them, and no half-width shows it.
+the track says so.
+
+Positions are those that the receiver would have reported. What it is wrong by for minutes at a time is in the fixes on
+both sides of a gap and in the filling between them, and hiding fixes cannot show it. The chain learns how large that
+slow error is (its fix offset), and the half-widths have it added:
+
+    half = z sqrt(inflation^2 (variance of the path + variance of a fix) + variance of the slow error)
 """
 
 import os
@@ -29,6 +34,9 @@ Floats = NDArray[np.float64]
 
 #: A piece is about this long, with this much context on both sides; a pause of the whole log ends a piece, s.
 PIECE, CONTEXT, PAUSE = 600.0, 60.0, 60.0
+
+#: A pause between fixes of this length is a gap even where it is usual in the log, s.
+LONG = 5.0
 
 #: Fixes that a method with a model of motion needs.
 FEWEST = 5
@@ -82,7 +90,7 @@ def fill(
     grid = sampled(drive_log, clock_offset=offset)
     messages: list[str] = []
     chosen = _chosen(grid, asked, messages)
-    if clock_offset is None and chosen.needs:
+    if clock_offset is None and chosen.name not in ("linear", "cv"):
         messages.append("the clocks of fixes and sensors were taken to agree")
     wanted, quality = _wanted(drive_log)
     t = drive_log.t[wanted]
@@ -140,18 +148,19 @@ def _chosen(grid: Grid, asked: Method | None, messages: list[str]) -> Method:
     if asked is not None and lacks is None:
         return asked
     if asked is not None:
-        messages.append(f"`{asked.name}` needs the {_words(str(lacks))}, which the log does not have")
+        messages.append(f"`{asked.name}` needs the {lacks}, which the log does not have")
     n = int(grid.seen.sum())
     if n < FEWEST:
         messages.append(f"the log has only {n} fix{'es' if n > 1 else ''}: straight lines between them")
         return METHODS["linear"]
-    missing = [name for name, there in (("speed", grid.has_speed), ("yaw_rate", grid.has_yaw_rate)) if not there]
-    if not missing:
-        return METHODS["em"]
-    messages.append(
-        f"the log has no {' and no '.join(_words(name) for name in missing)}: gaps are filled by constant velocity"
-    )
-    return METHODS["cv"]
+    if not grid.has_speed and not grid.has_yaw_rate:
+        messages.append("the log has neither speed nor yaw rate: gaps are filled by constant velocity")
+        return METHODS["cv"]
+    if not grid.has_speed:
+        messages.append("the log has no speed: in gaps it is taken to change evenly from one side to the other")
+    if not grid.has_yaw_rate:
+        messages.append("the log has no yaw rate: in gaps the turning is guessed from both sides")
+    return METHODS["em"]
 
 
 def _words(name: str) -> str:
@@ -164,11 +173,18 @@ def _wanted(log: Log) -> tuple[NDArray[np.intp], NDArray[np.str_]]:
     times = t[fixed]
     quality = np.where(fixed, "fix", "").astype("<U12")
     quality[~fixed & ((t < times[0]) | (t > times[-1]))] = "extrapolated"
-    for start, stop in log.gaps():
+    for start, stop in _gaps(log):
         a, b = np.searchsorted(t, start, side="right"), np.searchsorted(t, stop)
         quality[a:b] = "bridged"
     rows = np.flatnonzero(quality != "")
     return rows, quality[rows]
+
+
+def _gaps(log: Log) -> list[tuple[float, float]]:
+    """Return the log's gaps and every other pause between fixes that is long for any receiver."""
+    times = log.t[log.fixed]
+    long = np.flatnonzero(np.diff(times) > LONG)
+    return sorted({*log.gaps(), *((float(times[k]), float(times[k + 1])) for k in long)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +229,7 @@ def _pieces(grid: Grid, log: Log) -> list[_Piece]:
 def _spans(log: Log, t: Floats, quality: NDArray[np.str_]) -> Floats:
     """Return the lengths of the stretches to be filled, s."""
     fixes = log.t[log.fixed]
-    lengths = [stop - start for start, stop in log.gaps() if np.any((t > start) & (t < stop))]
+    lengths = [stop - start for start, stop in _gaps(log) if np.any((t > start) & (t < stop))]
     if np.any(quality == "extrapolated"):
         lengths += [s for s in (fixes[0] - log.t[0], log.t[-1] - fixes[-1]) if s > 0]
     return np.array(lengths)
@@ -229,6 +245,10 @@ def _distance_in_time(log: Log, t: Floats) -> tuple[Floats, Floats]:
     away = np.where(on_fix, 0.0, np.minimum(before, after))
     length = np.where(on_fix, 0.0, np.where(np.isfinite(before + after), before + after, 2 * away))
     return away, length
+
+
+#: Names of what the chain finds, as the settings of a track have them.
+_WORDS = {"speed_scale": "speed scale", "yaw_bias": "yaw bias", "slow_sd": "slow error of the fixes"}
 
 
 # ---- estimating ----------------------------------------------------------------------------------------------------
@@ -271,8 +291,8 @@ def _estimated(
         )
         messages.extend(_test_words(tested, lengths, level))
     settings.update({f"inflation at {one.length_s:.3g} s": round(one.inflation, 3) for one in tested})
-    # a variance that is only a shape may be made smaller by the test, one that a model claims may not
-    claimed = all(path.info.get("claimed", True) for path in paths)
+    # a variance that rests on a guess may be made smaller by the test, one that a model claims may not
+    claimed = all(path.info.get("claimed", True) for path in paths) and all(grid.has_speed for grid in grids)
     return _Answers(paths, tested, 1.0 if claimed else 0.0, settings)
 
 
@@ -299,9 +319,9 @@ def _chain(grids: Sequence[Grid], able: Sequence[int]) -> tuple[dict[int, Path],
         settings.update(
             {f"{name} noise": float(f"{value:.3g}") for name, value in zip(chain.GROUPS, sigma, strict=True)}
         )
-        for name in ("speed_scale", "yaw_bias"):
+        for name in ("speed_scale", "yaw_bias", "slow_sd"):
             value = np.average([fit.path.info[name] for fit in fits.values()], weights=weight)
-            settings[_words(name)] = float(f"{value:.4g}")
+            settings[_WORDS[name]] = float(f"{value:.4g}")
     return {i: fit.path for i, fit in fits.items()}, rerun, settings
 
 
@@ -425,11 +445,13 @@ class _Columns:
     speed: Floats
     variance: Floats  # (M, 2)
     fix_variance: Floats  # (M,)
+    slow_variance: Floats  # (M,)
 
 
 def _read(answers: _Answers, pieces: Sequence[_Piece], t: Floats) -> _Columns:
     """Read each row off the path of its piece."""
-    columns = _Columns(*(np.full(t.size, np.nan) for _ in range(4)), np.zeros((t.size, 2)), np.zeros(t.size))
+    east, north, azimuth, speed_at = (np.full(t.size, np.nan) for _ in range(4))
+    columns = _Columns(east, north, azimuth, speed_at, np.zeros((t.size, 2)), np.zeros(t.size), np.zeros(t.size))
     starts = np.array([piece.start for piece in pieces])
     of = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(pieces) - 1)
     for i, path in enumerate(answers.paths):
@@ -449,6 +471,7 @@ def _read(answers: _Answers, pieces: Sequence[_Piece], t: Floats) -> _Columns:
         for j in (0, 1):
             columns.variance[rows, j] = np.interp(at, path.t, variance[:, j])
         columns.fix_variance[rows] = path.fix_variance
+        columns.slow_variance[rows] = path.info.get("slow_sd", 0.0) ** 2
     return columns
 
 
@@ -475,9 +498,10 @@ def _half_widths(
     factor = np.ones(away.size)
     empty = quality != "fix"
     factor[empty] = calibrate.inflation(answers.tested, length[empty], least=answers.least)
-    half = z * factor[:, None] * np.sqrt(columns.variance + columns.fix_variance[:, None])
+    quick = factor[:, None] ** 2 * (columns.variance + columns.fix_variance[:, None])
+    half = z * np.sqrt(quick + columns.slow_variance[:, None])
     # twice: both the estimate and the vehicle are within reach of the nearest fix
-    limit = 2 * _top_speed(grid) * away + z * np.sqrt(columns.fix_variance) + 10.0
+    limit = 2 * _top_speed(grid) * away + z * np.sqrt(columns.fix_variance + columns.slow_variance) + 10.0
     return np.minimum(half, limit[:, None])
 
 
