@@ -106,8 +106,8 @@ def kind_of_bound(track: Track) -> str:
         ),
         "credible": (
             f"{share} credible interval",
-            f"east and north each lie inside with probability {share} under the model that was"
-            " fitted to this log. That is not a guarantee.",
+            f"where a fix would be, east and north each lie inside with probability {share} under the model that was"
+            " fitted to this log. That is not a guarantee, and an error that all fixes share is not in it.",
         ),
         "none": ("indication of size", "no probability is claimed for it."),
     }[track.guarantee]
@@ -761,7 +761,7 @@ def _own_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> str:
             f"{row['mean_m']:.2f}",
             f"{row['max_m']:.2f}",
             f"{100 * row['coverage']:.0f} %",
-            f"{max(row['inflation'], 1):.2f} times",
+            f"{row['inflation']:.2f} times" if row["inflation"] > 1.005 else "not needed",
         ]
         for row in rows
     ]
