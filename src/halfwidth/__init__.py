@@ -9,7 +9,7 @@ the user. NaN in y is a missing entry.
 
 import importlib
 import sys
-from types import ModuleType
+import types
 from typing import TYPE_CHECKING, Any
 
 from halfwidth.methods import ESTIMATORS
@@ -106,13 +106,13 @@ def __dir__() -> list[str]:
     return list(__all__)
 
 
-class _Front(ModuleType):
-    """Keeps a public function from being hidden by the module of the same name once that is imported."""
+class _Package(types.ModuleType):
+    """The package: a public function keeps its name although the module that holds it is called the same."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if isinstance(value, ModuleType) and name in _HOME:
-            value = getattr(value, name)
-        super().__setattr__(name, value)
+        # The import system binds every submodule it loads to the package; `halfwidth.learn` must stay the function.
+        if not (name in _HOME and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
 
 
-sys.modules[__name__].__class__ = _Front
+sys.modules[__name__].__class__ = _Package

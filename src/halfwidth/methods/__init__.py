@@ -7,6 +7,9 @@ from typing import Any
 ESTIMATORS: dict[str, str] = {
     "KalmanFilter": "kalman",
     "KalmanSmoother": "kalman",
+    "ExtendedKalman": "nonlinear",
+    "UnscentedKalman": "nonlinear",
+    "ParticleFilter": "particle",
 }
 
 

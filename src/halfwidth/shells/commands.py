@@ -71,7 +71,7 @@ Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more; show w
 NoProgress = Annotated[bool, typer.Option("--no-progress", help="Show no progress on long work.")]
 Level = Annotated[float, typer.Option(metavar="P", help="Probability of the intervals, between 0 and 1.")]
 ClockOffset = Annotated[
-    float,
+    float | None,
     typer.Option(
         metavar="S", help="Seconds to add to the clock of speed and yaw rate so that it agrees with the fixes'."
     ),
@@ -117,7 +117,7 @@ def fill(
     report: Annotated[str | None, typer.Option(metavar="HTML", help="Report to write: one HTML page.")] = None,
     method: Annotated[str | None, typer.Option(metavar="NAME", help="Estimator; the default needs no tuning.")] = None,
     level: Level = 0.9,
-    clock_offset: ClockOffset = 0.0,
+    clock_offset: ClockOffset = None,
     columns: Columns = None,
     json_: Json = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Read and check everything, write nothing.")] = False,
@@ -141,10 +141,10 @@ def fill(
     if output == "-" and report == "-":
         raise _usage("`-o` and `--report` both claim standard output", "--report FILE")
     _method_known(method)
-    if output is not None:
-        _ending_known(output, format_)
     for path in (output, report):
         _writable(path, log, force)
+    if output is not None:
+        _ending_known(output, format_)
     job = Job("fill", log, method=method, level=level, settings={"clock_offset": clock_offset},
               columns=parse_columns(columns or ""))  # fmt: skip
     if dry_run:
@@ -229,7 +229,7 @@ def outages(
     starts: Annotated[int, typer.Option(metavar="N", min=1, max=10_000, help="Outages of each length.")] = 20,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the random starts.")] = 1,
     methods: Annotated[str | None, typer.Option(metavar="NAME,...", help="Methods to compare; all if absent.")] = None,
-    clock_offset: ClockOffset = 0.0,
+    clock_offset: ClockOffset = None,
     columns: Columns = None,
     json_: Json = False,
     quiet: Quiet = False,
@@ -259,7 +259,7 @@ def outages(
     if json_:
         _print_json({"schema_version": SCHEMA_VERSION, "command": "outages", "log": _about(found), **result.to_dict()})
     else:
-        _out(_printable(result.summary().rstrip("\n")) + "\n")
+        _out(_printable(result.table()) + "\n")
     return cli.GOOD
 
 
@@ -376,8 +376,8 @@ def _usage(words: str, hint: str) -> Exception:
     return error
 
 
-def _finite(flag: str, value: float) -> None:
-    if not abs(value) < float("inf"):
+def _finite(flag: str, value: float | None) -> None:
+    if value is not None and not abs(value) < float("inf"):
         raise _usage(f"`{flag}` is {value}, a finite number of seconds is expected", f"{flag} 0.1")
 
 
@@ -395,7 +395,7 @@ def _method_known(name: str | None) -> None:
     """Refuse a method that is not there before any work is done."""
     if name is None:
         return
-    from halfwidth.vehicle import METHODS
+    from halfwidth.vehicle.estimators import METHODS
 
     if name not in METHODS:
         import difflib
@@ -627,7 +627,7 @@ def _doctor_text(found: Mapping[str, Any]) -> str:
 
 
 @contextmanager
-def _working(what: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+def _working(what: str, quiet: bool) -> Iterator[Callable[[float, str], None] | None]:
     """Show progress on a terminal while something runs: a clock, or a share where it is known."""
     terminal = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
     if quiet or not terminal:
@@ -639,12 +639,12 @@ def _working(what: str, quiet: bool) -> Iterator[Callable[[int, int], None] | No
 
     def draw(share: str) -> None:
         shown[0] = f"{what} {share}{time.monotonic() - started:.0f} s"
-        print(f"\r{shown[0]:<50}", end="", file=sys.stderr, flush=True)
+        print(f"\r{shown[0]:<70}", end="", file=sys.stderr, flush=True)
 
     latest = [""]
 
-    def progress(n: int, total: int) -> None:
-        latest[0] = f"{n}/{total}, "
+    def progress(share: float, words: str) -> None:
+        latest[0] = f"{100 * share:.0f} %, {words}, "
 
     def tick() -> None:
         # short work shows nothing at all
@@ -659,4 +659,4 @@ def _working(what: str, quiet: bool) -> Iterator[Callable[[int, int], None] | No
         done.set()
         thread.join()
         if shown[0]:
-            print(f"\r{'':<50}\r", end="", file=sys.stderr, flush=True)
+            print(f"\r{'':<70}\r", end="", file=sys.stderr, flush=True)

@@ -6,7 +6,7 @@ longitude in degrees of WGS-84, local positions in metres east and north.
 
 import importlib
 import sys
-from types import ModuleType
+import types
 from typing import TYPE_CHECKING, Any
 
 #: Public names and the module of each, loaded when first used.
@@ -17,7 +17,9 @@ _HOME: dict[str, str] = {
     "Log": "log",
     "Track": "track",
     "check": "check",
+    "fill": "fill",
     "from_frame": "formats",
+    "outages": "outage",
     "read": "formats",
     "simulate_drive": "drive",
 }
@@ -28,11 +30,13 @@ if TYPE_CHECKING:
     from halfwidth.vehicle.check import Check as Check
     from halfwidth.vehicle.check import check as check
     from halfwidth.vehicle.drive import simulate_drive as simulate_drive
+    from halfwidth.vehicle.fill import fill as fill
     from halfwidth.vehicle.formats import Limits as Limits
     from halfwidth.vehicle.formats import from_frame as from_frame
     from halfwidth.vehicle.formats import read as read
     from halfwidth.vehicle.log import Log as Log
     from halfwidth.vehicle.track import Gap as Gap
+    from halfwidth.vehicle.outage import outages as outages
     from halfwidth.vehicle.track import Track as Track
 
 
@@ -48,13 +52,13 @@ def __dir__() -> list[str]:
     return list(__all__)
 
 
-class _Front(ModuleType):
-    """Keeps a public function from being hidden by the module of the same name once that is imported."""
+class _Package(types.ModuleType):
+    """The package: a public function keeps its name although the module that holds it is called the same."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if isinstance(value, ModuleType) and name in _HOME:
-            value = getattr(value, name)
-        super().__setattr__(name, value)
+        # The import system binds every submodule it loads to the package; `vehicle.fill` must stay the function.
+        if not (name in _HOME and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
 
 
-sys.modules[__name__].__class__ = _Front
+sys.modules[__name__].__class__ = _Package

@@ -202,12 +202,13 @@ def inflation(found: Sequence[Tested], length: Floats, *, least: float = 1.0) ->
     """Return the factor on the standard deviation for gaps of these lengths.
 
     Between tested lengths it is interpolated in the logarithm of the length; beyond them the nearest counts. Below
-    `least` it is not taken: a model that was too wide on the log's easy stretches is left as it is.
+    `least` it is not taken: a model that was too wide on the log's easy stretches is left as it is. Without a test
+    it is 1.
 
     Parameters
     ----------
     found : sequence of Tested
-        Ascending lengths; without any the factor is `least`.
+        Ascending lengths.
     length : (n,) array
         s.
     least : float
@@ -217,7 +218,7 @@ def inflation(found: Sequence[Tested], length: Floats, *, least: float = 1.0) ->
     (n,) array
     """
     if not found:
-        return np.full(np.shape(length), least)
+        return np.ones(np.shape(length))
     at = np.log([one.length_s for one in found])
-    factor = np.maximum([one.inflation for one in found], max(least, 1e-6))
+    factor = np.maximum([one.inflation for one in found], max(least, 0.1))
     return np.exp(np.interp(np.log(np.maximum(length, 1e-3)), at, np.log(factor)))

@@ -21,10 +21,13 @@ The residuals are solved for the new state, which makes a linear model ``z[k] = 
 rotated with the car: a Rauch-Tung-Striebel smoother (the core's) gives the path, and the five scales are the means of
 posterior squared residuals (expectation maximisation, Shumway and Stoffer 1982). Each round re-linearises about its
 own path first. Many drives (outages of one log) are solved side by side.
+
+Without a speed sensor the speed is that of the fixes, with a large variance between them; without a gyro the yaw rate
+is taken as 0 and the scale of the yaw residual learns how much the car turns.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +128,7 @@ def solve(
     """
     if not drives:
         return []
+    drives = [_with_speed(drive) for drive in drives]
     rows = _rows(drives)
     psi = np.concatenate([azimuth_of(drive) for drive in drives] if azimuth is None else list(azimuth))
     s2 = np.array(np.broadcast_to(_START if sigma is None else sigma, (len(drives), 5))) ** 2
@@ -152,6 +156,8 @@ def azimuth_of(drive: Grid) -> Floats:
     (T,) array
         Radians, clockwise from north, continuous.
     """
+    if not drive.has_yaw_rate:
+        return _direction(drive)
     t, h = drive.t, drive.h
     turned = np.concatenate(([0.0], np.cumsum(-(drive.yaw_rate * h)[1:])))
     seen = np.flatnonzero(drive.seen)
@@ -176,7 +182,60 @@ def azimuth_of(drive: Grid) -> Floats:
     near2 = ((knots[:, None] - when) / 15.0) ** 2
     # far from all data the nearest one decides: the exponent is taken relative to the best of each knot
     turn = np.exp(-0.5 * (near2 - near2.min(axis=1, keepdims=True))) @ pointing
-    return turned + np.interp(t, knots, np.unwrap(np.angle(turn)))
+    first: Floats = turned + np.interp(t, knots, np.unwrap(np.angle(turn)))
+    return first
+
+
+def _secants(drive: Grid) -> tuple[Floats, Floats, NDArray[np.complex128]]:
+    """Return middle times, lengths in time and displacements (north + i east) between fixes about a second apart."""
+    seen = np.flatnonzero(drive.seen)
+    t = drive.t[seen]
+    if seen.size < 2:
+        return np.empty(0), np.empty(0), np.empty(0, dtype=complex)
+    stride = max(1, round(1.0 / max(float(np.median(np.diff(t))), 1e-3)))
+    stride = min(stride, seen.size - 1)
+    a, b = seen[:-stride], seen[stride:]
+    took = drive.t[b] - drive.t[a]
+    near = took <= max(3.0, 1.5 * float(np.median(took)))
+    a, b, took = a[near], b[near], took[near]
+    moved = (drive.north[b] - drive.north[a]) + 1j * (drive.east[b] - drive.east[a])
+    return 0.5 * (drive.t[a] + drive.t[b]), took, moved
+
+
+def _direction(drive: Grid) -> Floats:
+    """Return an azimuth without a yaw rate: the direction in which the fixes move, turning evenly between them."""
+    when, _, moved = _secants(drive)
+    far = np.abs(moved) > 0.5
+    if not far.any():
+        return np.zeros(len(drive))
+    turning: Floats = np.interp(drive.t, when[far], np.unwrap(np.angle(moved[far])))
+    return turning
+
+
+def _with_speed(drive: Grid) -> Grid:
+    """Give a drive without a speed sensor the speed of its fixes, changing evenly where there are none.
+
+    Where no fix is near, the guess may be off by 0.7 m/s for each second to the next one, at most by 5 m/s.
+    """
+    if drive.has_speed:
+        return drive
+    when, took, moved = _secants(drive)
+    if when.size == 0:
+        return replace(drive, speed_sd=np.full(len(drive), 5.0), has_speed=True)
+    h = drive.h
+    middle = drive.t - 0.5 * h
+    k = np.searchsorted(when, middle)
+    before, after = when[np.maximum(k - 1, 0)], when[np.minimum(k, when.size - 1)]
+    outside = (k == 0) | (k == when.size)
+    far = np.where(
+        outside, np.abs(middle - np.where(k == 0, after, before)), np.minimum(middle - before, after - middle)
+    )
+    pause = np.where(outside, 2 * far, after - before)
+    sd = np.minimum(0.7 * far, 5.0) * np.sqrt(np.maximum(pause / h, 1.0))
+    lost = pause > 1.5 * float(np.median(took))
+    return replace(
+        drive, speed=np.interp(middle, when, np.abs(moved) / took), speed_sd=np.where(lost, sd, 0.0), has_speed=True
+    )
 
 
 @dataclass(frozen=True, eq=False)

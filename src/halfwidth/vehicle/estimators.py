@@ -55,6 +55,8 @@ class Method:
         Seconds of data it gets on each side of an outage in the benchmark.
     needs : tuple of str
         Sensors it cannot do without: ``"speed"``, ``"yaw_rate"``.
+    one_of : tuple of str
+        Sensors of which it needs one.
     run : function (drives, tuned) -> list of Path
     tune : function (drive) -> mapping
         What it learns from the whole log, once.
@@ -66,11 +68,15 @@ class Method:
     needs: tuple[str, ...]
     run: Callable[[Sequence[Grid], Tuned], list[Path]]
     tune: Callable[[Grid], Tuned] = lambda drive: _NOTHING  # noqa: ARG005
+    one_of: tuple[str, ...] = ()
 
     def lacks(self, drive: Grid) -> str | None:
-        """Return the sensor that the drive does not have, or None."""
+        """Return in words the sensor that the drive does not have, or None."""
         there = {"speed": drive.has_speed, "yaw_rate": drive.has_yaw_rate}
-        return next((name for name in self.needs if not there[name]), None)
+        missing = [name for name in self.needs if not there[name]]
+        if not missing and self.one_of and not any(there[name] for name in self.one_of):
+            missing = [" or ".join(self.one_of)]
+        return missing[0].replace("_", " ") if missing else None
 
 
 def method(name: str) -> Method:
@@ -154,7 +160,8 @@ def _acceleration(drive: Grid) -> Floats:
     azimuth, v, h = chain.azimuth_of(drive), drive.speed, drive.h
     at_node = 0.5 * (v + np.concatenate((v[1:], v[-1:])))
     velocity = at_node[:, None] * np.column_stack((np.sin(azimuth), np.cos(azimuth)))
-    return np.diff(velocity, axis=0, prepend=velocity[:1]) / h[:, None]
+    pushed: Floats = np.diff(velocity, axis=0, prepend=velocity[:1]) / h[:, None]
+    return pushed
 
 
 def _fixes(drive: Grid) -> tuple[Floats, Floats]:
@@ -350,7 +357,7 @@ METHODS: Mapping[str, Method] = MappingProxyType(
             Method("cv", "constant velocity, RTS smoother", 20.0, (), _smoothed(False), _tuned(False)),
             Method("gpsins", "linear GPS/INS, RTS smoother", 20.0, _SENSORS, _smoothed(True), _tuned(True)),
             Method("ctrv", "constant turn rate and velocity, EKF + RTS", 20.0, _SENSORS, _turning, _tuned_ctrv),
-            Method("em", "chain that learns its own noise", 60.0, _SENSORS, _chain),
+            Method("em", "chain that learns its own noise", 60.0, (), _chain, one_of=_SENSORS),
             Method(
                 "paper000",
                 "GPS/INS by linear programming, as printed",

@@ -30,6 +30,9 @@ Floats = NDArray[np.float64]
 #: A piece is about this long, with this much context on both sides; a pause of the whole log ends a piece, s.
 PIECE, CONTEXT, PAUSE = 600.0, 60.0, 60.0
 
+#: A pause between fixes of this length is a gap even where it is usual in the log, s.
+LONG = 5.0
+
 #: Fixes that a method with a model of motion needs.
 FEWEST = 5
 
@@ -82,7 +85,7 @@ def fill(
     grid = sampled(drive_log, clock_offset=offset)
     messages: list[str] = []
     chosen = _chosen(grid, asked, messages)
-    if clock_offset is None and chosen.needs:
+    if clock_offset is None and chosen.name not in ("linear", "cv"):
         messages.append("the clocks of fixes and sensors were taken to agree")
     wanted, quality = _wanted(drive_log)
     t = drive_log.t[wanted]
@@ -140,18 +143,19 @@ def _chosen(grid: Grid, asked: Method | None, messages: list[str]) -> Method:
     if asked is not None and lacks is None:
         return asked
     if asked is not None:
-        messages.append(f"`{asked.name}` needs the {_words(str(lacks))}, which the log does not have")
+        messages.append(f"`{asked.name}` needs the {lacks}, which the log does not have")
     n = int(grid.seen.sum())
     if n < FEWEST:
         messages.append(f"the log has only {n} fix{'es' if n > 1 else ''}: straight lines between them")
         return METHODS["linear"]
-    missing = [name for name, there in (("speed", grid.has_speed), ("yaw_rate", grid.has_yaw_rate)) if not there]
-    if not missing:
-        return METHODS["em"]
-    messages.append(
-        f"the log has no {' and no '.join(_words(name) for name in missing)}: gaps are filled by constant velocity"
-    )
-    return METHODS["cv"]
+    if not grid.has_speed and not grid.has_yaw_rate:
+        messages.append("the log has neither speed nor yaw rate: gaps are filled by constant velocity")
+        return METHODS["cv"]
+    if not grid.has_speed:
+        messages.append("the log has no speed: in gaps it is taken to change evenly from one side to the other")
+    if not grid.has_yaw_rate:
+        messages.append("the log has no yaw rate: in gaps the turning is guessed from both sides")
+    return METHODS["em"]
 
 
 def _words(name: str) -> str:
@@ -164,11 +168,18 @@ def _wanted(log: Log) -> tuple[NDArray[np.intp], NDArray[np.str_]]:
     times = t[fixed]
     quality = np.where(fixed, "fix", "").astype("<U12")
     quality[~fixed & ((t < times[0]) | (t > times[-1]))] = "extrapolated"
-    for start, stop in log.gaps():
+    for start, stop in _gaps(log):
         a, b = np.searchsorted(t, start, side="right"), np.searchsorted(t, stop)
         quality[a:b] = "bridged"
     rows = np.flatnonzero(quality != "")
     return rows, quality[rows]
+
+
+def _gaps(log: Log) -> list[tuple[float, float]]:
+    """Return the log's gaps and every other pause between fixes that is long for any receiver."""
+    times = log.t[log.fixed]
+    long = np.flatnonzero(np.diff(times) > LONG)
+    return sorted({*log.gaps(), *((float(times[k]), float(times[k + 1])) for k in long)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +224,7 @@ def _pieces(grid: Grid, log: Log) -> list[_Piece]:
 def _spans(log: Log, t: Floats, quality: NDArray[np.str_]) -> Floats:
     """Return the lengths of the stretches to be filled, s."""
     fixes = log.t[log.fixed]
-    lengths = [stop - start for start, stop in log.gaps() if np.any((t > start) & (t < stop))]
+    lengths = [stop - start for start, stop in _gaps(log) if np.any((t > start) & (t < stop))]
     if np.any(quality == "extrapolated"):
         lengths += [s for s in (fixes[0] - log.t[0], log.t[-1] - fixes[-1]) if s > 0]
     return np.array(lengths)
@@ -271,8 +282,8 @@ def _estimated(
         )
         messages.extend(_test_words(tested, lengths, level))
     settings.update({f"inflation at {one.length_s:.3g} s": round(one.inflation, 3) for one in tested})
-    # a variance that is only a shape may be made smaller by the test, one that a model claims may not
-    claimed = all(path.info.get("claimed", True) for path in paths)
+    # a variance that rests on a guess may be made smaller by the test, one that a model claims may not
+    claimed = all(path.info.get("claimed", True) for path in paths) and all(grid.has_speed for grid in grids)
     return _Answers(paths, tested, 1.0 if claimed else 0.0, settings)
 
 
@@ -429,7 +440,8 @@ class _Columns:
 
 def _read(answers: _Answers, pieces: Sequence[_Piece], t: Floats) -> _Columns:
     """Read each row off the path of its piece."""
-    columns = _Columns(*(np.full(t.size, np.nan) for _ in range(4)), np.zeros((t.size, 2)), np.zeros(t.size))
+    east, north, azimuth, speed_at = (np.full(t.size, np.nan) for _ in range(4))
+    columns = _Columns(east, north, azimuth, speed_at, np.zeros((t.size, 2)), np.zeros(t.size))
     starts = np.array([piece.start for piece in pieces])
     of = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(pieces) - 1)
     for i, path in enumerate(answers.paths):

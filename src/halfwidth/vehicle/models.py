@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from halfwidth.model import Linear, Nonlinear, Prior
+from halfwidth.model import Linear, Names, Nonlinear, Prior
 from halfwidth.noise import Gaussian, Mixed, Uniform
 from halfwidth.spread import Normal
 
@@ -160,9 +160,7 @@ def two_antenna(
         return np.array([x[0], x[1], x[2], x[3], course, x[5], x[6]])
 
     names = ("east1", "north1", "east2", "north2", "azimuth", "speed", "yaw_rate")
-    return Nonlinear(
-        g, h, _noise(q), _noise(r), x0, names={"x": names, "y": names, "u": ()}, x_angles=(4,), y_angles=(4,)
-    )
+    return Nonlinear(g, h, _noise(q), _noise(r), x0, names=Names(names, names, ()), x_angles=(4,), y_angles=(4,))
 
 
 def ctrv(q: Given, r: Given, *, x0: Prior | None = None, theta: bool = False, euler: bool = False) -> Nonlinear:
@@ -208,7 +206,7 @@ def ctrv(q: Given, r: Given, *, x0: Prior | None = None, theta: bool = False, eu
         x0 = Normal(mean[:n], variances[:n])
     names = ("east", "north", "azimuth", "speed", "yaw_rate", "speed_scale", "yaw_bias")[:n]
     outputs = ("east", "north", "speed", "yaw_rate")
-    return Nonlinear(g, h, _noise(q), _noise(r), x0, names={"x": names, "y": outputs, "u": ()}, x_angles=(2,))
+    return Nonlinear(g, h, _noise(q), _noise(r), x0, names=Names(names, outputs, ()), x_angles=(2,))
 
 
 def displacement(azimuth: ArrayLike, speed: ArrayLike, dt: ArrayLike, *, euler: bool = False) -> Floats:
@@ -233,7 +231,7 @@ def displacement(azimuth: ArrayLike, speed: ArrayLike, dt: ArrayLike, *, euler: 
     a, v, h = np.asarray(azimuth, float), np.asarray(speed, float), np.asarray(dt, float)
     before = np.concatenate((a[:1], a[:-1]))
     along = before if euler else 0.5 * (before + a)
-    moved = (h * v)[:, None] * np.column_stack((np.sin(along), np.cos(along)))
+    moved: Floats = (h * v)[:, None] * np.column_stack((np.sin(along), np.cos(along)))
     moved[:1] = 0.0
     return moved
 

@@ -309,7 +309,7 @@ def outages(
     drive = sampled(drive_log, clock_offset=offset)
     if int(drive.seen.sum()) < 3:
         raise BadLog(f"the log has {int(drive.seen.sum())} fixes, at least 3 are expected to hide some")
-    skipped = {m.name: f"the log has no {lack.replace('_', ' ')}" for m in chosen if (lack := m.lacks(drive))}
+    skipped = {m.name: f"the log has no {lack}" for m in chosen if (lack := m.lacks(drive))}
     usable_methods = [m for m in chosen if m.name not in skipped]
     places = {length: _starts(drive, length, starts, seed) for length in given}
     for length in given:
@@ -318,7 +318,8 @@ def outages(
         elif places[length].size < starts:
             skipped[f"{length:g} s"] = f"only {places[length].size} of {starts} starts found a place"
     tried = [length for length in given if places[length].size]
-    total, cells = len(usable_methods) * len(tried), []
+    total = len(usable_methods) * len(tried)
+    cells: list[Cell] = []
     for m in usable_methods:
         tuned = m.tune(drive) if tried else {}
         for length in tried:

@@ -133,6 +133,16 @@ def round_step(size: float) -> float:
     return float(power * min(k for k in (1, 2, 5, 10) if k * power >= size * (1 - 1e-9)))
 
 
+def pause_of(t: Floats) -> float:
+    """Choose the step in time, in seconds, beyond which rows are not joined by a line."""
+    return max(5 * float(np.median(np.diff(t))), 2.0) if t.size > 1 else 2.0
+
+
+def pauses_of(t: Floats) -> Rows:
+    """Find the rows after which the log pauses."""
+    return np.flatnonzero(np.diff(t) > pause_of(t)).astype(np.int64)
+
+
 def limits_of(half_m: Floats, most: int = 5) -> list[float]:
     """Choose the limits between the colours of half-widths: from the series 1, 2, 5, in metres."""
     if half_m.size == 0:
@@ -260,7 +270,10 @@ def map_svg(track: Track, plane: Plane, view: View, rows: Rows, limits: Sequence
         ]
         gaps.append(f"<g{dashed}>{''.join(parts)}</g>")
     out.append(f'<g id="bands" class="band">{"".join(bands)}</g>')
-    out.append(f'<path class="way" d="{line(x, y)}"/>')
+    # no line where the log has no rows: nobody knows how the vehicle went
+    before = np.searchsorted(rows, pauses_of(track.t_s), side="right")
+    parts = np.split(np.arange(rows.size), before)
+    out.append(f'<path class="way" d="{"".join(line(x[part], y[part]) for part in parts)}"/>')
     fx, fy = plane.units(log.lat_deg[seen], log.lon_deg[seen])
     out.append(f'<path id="fixes" class="fix" d="{dots(fx, fy)}"/>')
     out.append(f'<g id="filled" class="gap">{"".join(gaps)}</g>')
