@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from halfwidth.vehicle.formats import from_frame as from_frame
     from halfwidth.vehicle.formats import read as read
     from halfwidth.vehicle.log import Log as Log
-    from halfwidth.vehicle.track import Gap as Gap
     from halfwidth.vehicle.outage import outages as outages
+    from halfwidth.vehicle.track import Gap as Gap
     from halfwidth.vehicle.track import Track as Track
 
 

@@ -302,8 +302,8 @@ def scale_bar(view: View, plane: Plane) -> tuple[float, float]:
     return length, 100 * length / wide
 
 
-def chart_path(t: Floats, y: Floats, t0: float, t1: float, y0: float, y1: float) -> str:
-    """Draw values against time; unknown values and jumps by more than half the range break it.
+def chart_path(t: Floats, y: Floats, t0: float, t1: float, y0: float, y1: float, pause: float | None = None) -> str:
+    """Draw values against time; unknown values and pauses break the line.
 
     At most four points are kept in each of 500 slices of time, the first, the last, the smallest
     and the largest, which draws the same picture.
@@ -322,9 +322,10 @@ def chart_path(t: Floats, y: Floats, t0: float, t1: float, y0: float, y1: float)
         kept = known
     px = (t[kept] - t0) / max(t1 - t0, 1e-9) * CHART_WIDTH
     py = CHART_HEIGHT - (np.clip(y[kept], y0, y1) - y0) / (y1 - y0) * CHART_HEIGHT
-    # an unknown value in between breaks the line
-    unknown = np.cumsum(~np.isfinite(y))
-    broken = np.diff(unknown[kept]) > 0
+    # an unknown value in between breaks the line, and so does a pause
+    breaks = np.cumsum(~np.isfinite(y))
+    breaks[1:] += np.cumsum(np.diff(t) > (pause_of(t) if pause is None else pause))
+    broken = np.diff(breaks[kept]) > 0
     pieces = np.split(np.arange(kept.size), np.flatnonzero(broken) + 1)
     return "".join(line(px[piece], py[piece]) for piece in pieces)
 
@@ -333,4 +334,5 @@ def turning_path(t: Floats, azimuth_deg: Floats, t0: float, t1: float) -> str:
     """Draw an azimuth from 0 to 360 degrees, broken where it passes north."""
     jump = np.flatnonzero(np.abs(np.diff(azimuth_deg)) > 180)
     parts = np.split(np.arange(t.size), jump + 1)
-    return "".join(chart_path(t[part], azimuth_deg[part], t0, t1, 0.0, 360.0) for part in parts)
+    pause = pause_of(t)
+    return "".join(chart_path(t[part], azimuth_deg[part], t0, t1, 0.0, 360.0, pause) for part in parts)

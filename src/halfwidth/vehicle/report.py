@@ -951,7 +951,7 @@ def _data(
         "northm": plane.north_m,
         "view": [round(view.x), round(view.y), round(view.width), round(view.height)],
         "zero": _zero(track),
-        "pause": picture.pause_of(track.t_s),
+        "pause": picture.pause_of(track.t_s[rows]),
         "epoch": unix,
         "t": _differences(track.t_s[rows] * 1000),
         "x": _differences(x),
