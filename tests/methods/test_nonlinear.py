@@ -269,7 +269,7 @@ def test_a_branch_met_only_on_the_way_is_found_out():
 
     def g(x):
         try:
-            return x + 1.0 if x[0] < 5 else x + 2.0
+            return x + 1.0 if float(x[0]) < 5 else x + 2.0
         except Exception:
             return x + 1.0
 
@@ -279,6 +279,26 @@ def test_a_branch_met_only_on_the_way_is_found_out():
     assert est.info["evaluated"] == "python"
     assert "states found" in est.info["reason"]
     assert est.x[-1, 0] == pytest.approx(15.0)
+
+
+def test_branches_run_compiled():
+    """The usual special case for driving straight on, as users write it."""
+
+    def step(x, u, dt):
+        px, py, v, a, w = x
+        if abs(w) < 1e-4:
+            return np.array([px + v * dt * np.cos(a), py + v * dt * np.sin(a), v + u[0] * dt, a, w])
+        return ctrv_step(x, u, dt)
+
+    model = dataclasses.replace(ctrv(), g=step)
+    _, record = drive(ctrv(), 2)
+    for method in (ExtendedKalman(smooth=True), UnscentedKalman()):
+        est = hw.estimate(model, record, method)
+        assert est.info["evaluated"] == "compiled"
+        np.testing.assert_allclose(est.x, hw.estimate(ctrv(), record, method).x, rtol=1e-6, atol=1e-6)
+    straight = model.linearise([0.0, 0.0, 8.0, 0.5, 0.0], [0.1], by="tape")
+    np.testing.assert_allclose(straight.g[:2], [1.6 * np.cos(0.5), 1.6 * np.sin(0.5)])
+    np.testing.assert_array_equal(straight.g_x[3], [0, 0, 0, 1, 0])
 
 
 def test_jacobians_of_the_user():
