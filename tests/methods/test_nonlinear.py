@@ -531,6 +531,40 @@ def test_a_g_that_raises_later_is_named_with_its_time():
         hw.estimate(model, hw.Record(np.arange(9.0), np.full(9, np.nan)), ExtendedKalman())
 
 
+def test_functions_that_fail_far_away_do_no_harm():
+    """Tapes are tried at points that a run never meets; what happens there is not the user's problem."""
+
+    def g(x):
+        if abs(x[0]) > 2.5:
+            raise RuntimeError("too far")
+        return 0.5 * x
+
+    def h(x):
+        try:
+            far = abs(float(x[0])) > 2.5
+        except Exception:
+            far = False
+        if far:
+            raise RuntimeError("too far")
+        return x
+
+    def h_x(x):
+        if abs(x[0]) > 2.5:
+            raise RuntimeError("too far")
+        return np.eye(1)
+
+    record = hw.Record(np.arange(5.0), [0.1, None, 0.2, 0.1, 0.0])
+    settings = (hw.Gaussian(0.1), hw.Gaussian(0.1), hw.Normal([0.5], 1.0))
+    want = hw.estimate(hw.Nonlinear(lambda x: 0.5 * x, lambda x: x, *settings), record, ExtendedKalman())
+    for model in (
+        hw.Nonlinear(g, lambda x: x, *settings),
+        hw.Nonlinear(lambda x: 0.5 * x, h, *settings),
+        hw.Nonlinear(lambda x: 0.5 * x, lambda x: x, *settings, h_x=h_x),
+    ):
+        got = hw.estimate(model, record, ExtendedKalman())
+        np.testing.assert_allclose(got.x, want.x, rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
