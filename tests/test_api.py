@@ -6,9 +6,10 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BadLog BadRecord BadShape BadValue Box Cloud DataQualityWarning Estimate Estimator Gaussian HalfwidthError
-KalmanFilter KalmanSmoother Learned Linear Missing Mixed Nonlinear Normal Record Recursive Refused Status Uniform
-Unsolved __version__ estimate forecast from_continuous learn resume score simulate stream
+BadLog BadRecord BadShape BadValue BatchLP Box Cloud DataQualityWarning Estimate Estimator ExtendedKalman Gaussian
+HalfwidthError KalmanFilter KalmanSmoother Learned Linear Missing Mixed Nonlinear Normal ParticleFilter Record
+Recursive Refused Status Uniform UnscentedKalman Unsolved __version__ estimate forecast from_continuous learn resume
+score simulate stream
 """
 
 
@@ -30,3 +31,9 @@ def test_importing_loads_no_optional_library():
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+def test_functions_keep_their_names_whatever_was_imported_first():
+    code = "import halfwidth.estimate, halfwidth.learn, halfwidth.score, halfwidth as hw; print(callable(hw.estimate), callable(hw.learn))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["True", "True"]

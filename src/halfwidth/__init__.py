@@ -70,6 +70,9 @@ if TYPE_CHECKING:
     from halfwidth.learn import learn as learn
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
+    from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
+    from halfwidth.methods.particle import ParticleFilter as ParticleFilter
     from halfwidth.model import Linear as Linear
     from halfwidth.model import Nonlinear as Nonlinear
     from halfwidth.noise import Gaussian as Gaussian
@@ -100,12 +103,12 @@ def __dir__() -> list[str]:
 
 
 class _Package(types.ModuleType):
-    """The package keeps its functions: importing the module `halfwidth.estimate` must not hide `estimate`."""
+    """The package: a public function keeps its name although the module that holds it is called the same."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if isinstance(value, types.ModuleType) and _HOME.get(name) == name:
-            value = getattr(value, name)
-        super().__setattr__(name, value)
+        # The import system binds every submodule it loads to the package; `halfwidth.learn` must stay the function.
+        if not (name in _HOME and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
 
 
 sys.modules[__name__].__class__ = _Package

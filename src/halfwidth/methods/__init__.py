@@ -7,6 +7,10 @@ from typing import Any
 ESTIMATORS: dict[str, str] = {
     "KalmanFilter": "kalman",
     "KalmanSmoother": "kalman",
+    "ExtendedKalman": "nonlinear",
+    "UnscentedKalman": "nonlinear",
+    "ParticleFilter": "particle",
+    "BatchLP": "map",
 }
 
 
