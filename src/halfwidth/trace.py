@@ -196,7 +196,24 @@ _NAMES = {
     "true_divide": "divide", "mod": "remainder", "fmax": "maximum", "fmin": "minimum",
 }  # fmt: skip
 _TWO = frozenset(
-    ["add", "subtract", "multiply", "divide", "power", "arctan2", "hypot", "maximum", "minimum", "remainder", "fmod", "floor_divide", "less", "less_equal", "equal", "not_equal"]
+    [
+        "add",
+        "subtract",
+        "multiply",
+        "divide",
+        "power",
+        "arctan2",
+        "hypot",
+        "maximum",
+        "minimum",
+        "remainder",
+        "fmod",
+        "floor_divide",
+        "less",
+        "less_equal",
+        "equal",
+        "not_equal",
+    ]
 )
 _COMMUTING = frozenset({"add", "multiply", "hypot", "equal", "not_equal"})
 _SPLIT: dict[str, Callable[..., Any]] = {
@@ -575,7 +592,38 @@ for _symbol, _name in {"neg": "negative", "abs": "absolute", "pos": "positive", 
                        "trunc": "trunc"}.items():  # fmt: skip
     setattr(_Variable, f"__{_symbol}__", _unary(_name))
 # NumPy's object loops call methods of the entries by the name of the function.
-for _name in ["sqrt", "cbrt", "square", "reciprocal", "sign", "exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh", "rint", "deg2rad", "rad2deg", "radians", "degrees", "conjugate"]:
+for _name in [
+    "sqrt",
+    "cbrt",
+    "square",
+    "reciprocal",
+    "sign",
+    "exp",
+    "exp2",
+    "expm1",
+    "log",
+    "log2",
+    "log10",
+    "log1p",
+    "sin",
+    "cos",
+    "tan",
+    "arcsin",
+    "arccos",
+    "arctan",
+    "sinh",
+    "cosh",
+    "tanh",
+    "arcsinh",
+    "arccosh",
+    "arctanh",
+    "rint",
+    "deg2rad",
+    "rad2deg",
+    "radians",
+    "degrees",
+    "conjugate",
+]:
     setattr(_Variable, _name, _unary(_name))
 for _name in ("arctan2", "hypot", "fmod"):
     setattr(_Variable, _name, _operator(_name))
