@@ -17,6 +17,8 @@ from halfwidth.result import Estimate
 DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("KalmanSmoother", {}),
     ("UnscentedKalman", {"smooth": True}),
+    ("BatchLP", {}),
+    ("ParticleFilter", {}),
 )
 
 
