@@ -299,7 +299,7 @@ def test_a_long_list_of_gaps_starts_with_the_worst():
     text = page(track)
     assert "The 20 known worst." in text
     assert f"All {len(track.gaps)} gaps" in text
-    assert len(page(made_track()).split("known worst")) == 1
+    assert "The 20 known worst." not in page(made_track())
 
 
 def test_thinning_keeps_the_ends_of_gaps_and_the_worst_row():
@@ -326,8 +326,7 @@ def test_pauses_of_the_log_are_named_and_not_drawn_across():
 
 
 def test_worst_half_width_beyond_the_last_fix_is_said_so():
-    track = made_track(outages=())
-    assert track.gaps[-1].quality == "extrapolated"
+    track = made_track(gaps=made_track().gaps[-1:])
     assert verdict(track).replace("\u00a0", " ").endswith("1 s after the last fix.")
 
 
