@@ -294,6 +294,14 @@ def test_page_of_a_huge_track_is_bounded(many):
     assert ("The 500 known worst of" in text) == (many == "gaps")
 
 
+def test_a_long_list_of_gaps_starts_with_the_worst():
+    track = made_track(1000, outages=tuple((10 * k + 3, 10 * k + 4 + k % 3) for k in range(60)))
+    text = page(track)
+    assert "The 20 known worst." in text
+    assert f"All {len(track.gaps)} gaps" in text
+    assert "The 20 known worst." not in page(made_track())
+
+
 def test_thinning_keeps_the_ends_of_gaps_and_the_worst_row():
     track = simulated(20_000)
     rows = picture.shown_rows(track, 3000)
@@ -304,6 +312,22 @@ def test_thinning_keeps_the_ends_of_gaps_and_the_worst_row():
         assert {first + 1, stop - 2} <= set(rows.tolist())
     inside = np.isin(rows, np.flatnonzero(track.quality != "fix"))
     assert inside.mean() > 0.3  # gaps are drawn finer than the rest
+
+
+def test_pauses_of_the_log_are_named_and_not_drawn_across():
+    t = np.arange(120) / 10 + np.where(np.arange(120) >= 70, 45.0, 0.0)
+    text = page(made_track(t_s=t, gaps=(), outages=(), quality=np.full(120, "fix")))
+    assert "the log has no rows for 45.1 s from 6.9 s: nothing is filled there" in Reader(text).text().replace(
+        "\u00a0", " "
+    )
+    assert re.search(r'class="way" d="([^"]*)"', text)[1].count("M") == 2
+    assert re.search(r'id="l-speed" d="([^"]*)"', text)[1].count("M") == 2
+    assert "has no rows" not in page(made_track())
+
+
+def test_worst_half_width_beyond_the_last_fix_is_said_so():
+    track = made_track(gaps=made_track().gaps[-1:])
+    assert verdict(track).replace("\u00a0", " ").endswith("1 s after the last fix.")
 
 
 # --- drawing --------------------------------------------------------------------------------------

@@ -112,8 +112,8 @@ class Demo:
                 "",
                 *lines,
                 "",
-                "stated: the largest half-width, east or north, at level"
-                f" {track.level:g}; inside: true positions within both.",
+                f"stated: the largest half-width at level {track.level:g}, east or north, about where a fix would be; the",
+                "receiver's own slow error, which all fixes share, comes on top. inside: true positions within both.",
                 "",
                 f"log     {self.log}",
                 f"track   {self.output}",

@@ -272,8 +272,8 @@ def map_svg(track: Track, plane: Plane, view: View, rows: Rows, limits: Sequence
     out.append(f'<g id="bands" class="band">{"".join(bands)}</g>')
     # no line where the log has no rows: nobody knows how the vehicle went
     before = np.searchsorted(rows, pauses_of(track.t_s), side="right")
-    parts = np.split(np.arange(rows.size), before)
-    out.append(f'<path class="way" d="{"".join(line(x[part], y[part]) for part in parts)}"/>')
+    pieces = np.split(np.arange(rows.size), before)
+    out.append(f'<path class="way" d="{"".join(line(x[piece], y[piece]) for piece in pieces)}"/>')
     fx, fy = plane.units(log.lat_deg[seen], log.lon_deg[seen])
     out.append(f'<path id="fixes" class="fix" d="{dots(fx, fy)}"/>')
     out.append(f'<g id="filled" class="gap">{"".join(gaps)}</g>')

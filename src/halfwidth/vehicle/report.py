@@ -429,7 +429,7 @@ def _map_section(track: Track, plane: Plane, view: View, rows: Rows, limits: Seq
         f'{_length(step)}</span>.{thinned} <span class="live hide">Drag to move; click, then turn the'
         " wheel to zoom; keys: arrows, + − 0, n and p for the next and previous gap, comma and full"
         " stop to step in time.</span></p>\n"
-        f'<div class="stage"><div class="tools live hide">{buttons}</div>\n'
+        f'<div class="tools live hide">{buttons}</div>\n'
         '<div class="map" id="frame" tabindex="0" role="application" aria-roledescription="map"'
         f' aria-label="{_t(_map_words(track))}">\n'
         f'<svg id="map" viewBox="{view.box()}" aria-hidden="true">{drawn}'
@@ -437,7 +437,7 @@ def _map_section(track: Track, plane: Plane, view: View, rows: Rows, limits: Seq
         f'{pins}<div class="tip live hide" id="tip" aria-hidden="true"></div>\n'
         '<div class="north" aria-hidden="true"><svg viewBox="0 0 20 26"><path d="M10 0l8 26-8-6-8 6z"/>'
         "</svg>N</div>\n"
-        f'<div class="bar" id="bar"><span id="barlength">{_length(length)}</span></div>\n</div></div>\n'
+        f'<div class="bar" id="bar"><span id="barlength">{_length(length)}</span></div>\n</div>\n'
         f'<ul class="legend">{"".join(f"<li>{item}</li>" for item in items)}</ul>\n'
         '<div class="cursor live hide"><label for="when">moment</label>'
         f'<input type="range" id="when" min="0" max="{rows.size - 1}" step="1" value="0">'
