@@ -293,8 +293,12 @@ def demo(
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
         raise _usage(f"`{output}` is a file, a folder is expected", "-o FOLDER")
-    if folder.is_dir() and any(folder.iterdir()) and not force:
-        raise _usage(f"`{output}` holds files already", "--force to overwrite them, or -o FOLDER for another place")
+    held = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    # a demonstration is made anew, so that the same command can be typed twice; anything else is kept
+    if held and held != {"drive.csv", "track.gpx", "report.html"} and not force:
+        raise _usage(
+            f"`{output}` holds other files already", "--force to overwrite them, or -o FOLDER for another place"
+        )
     with _working("demo", quiet or no_progress):
         result = drive.run(folder, seed=seed)
     if json_:
