@@ -158,6 +158,24 @@ def test_a_function_that_hides_a_branch_is_found_out():
         compiled(f, (2,), [(np.array([1.0, 2.0]),), (np.array([-1.0, 2.0]),)])
 
 
+def test_a_small_entry_that_is_wrong_is_not_hidden_by_a_large_one():
+    def f(x):
+        try:
+            small = 1e-9 if x[0] > 0 else -1e-9
+        except Exception:
+            small = 1e-9
+        return np.array([1e12 + x[0], small])
+
+    with pytest.raises(Untraceable, match="other values"):
+        compiled(f, (1,), [(np.array([1.0]),), (np.array([-1.0]),)])
+
+
+def test_rounding_that_cancellation_has_made_large_is_no_difference():
+    # NumPy's power and the tape's product of three differ in the last place; the difference of large numbers shows it.
+    points = [(np.array([a]),) for a in np.linspace(1e5, 1e6, 50)]
+    assert compiled(lambda x: x**3 - np.floor(x) ** 3, (1,), points)
+
+
 def test_a_function_that_is_never_finite_is_not_trusted():
     with np.errstate(all="ignore"), pytest.raises(Untraceable):
         compiled(lambda x: np.sqrt(x), (1,), [(np.array([-1.0]),)])
@@ -235,8 +253,7 @@ def test_random_expressions(data):
     with np.errstate(all="ignore"):
         try:
             tape = trace(f, (2,))
-        except Untraceable as refusal:
-            assert "NaN" in str(refusal)
+        except Untraceable:  # a constant became NaN
             return
         expected = np.array([f(p) for p in points])
         got = tape(points)

@@ -75,6 +75,9 @@ if TYPE_CHECKING:
     from halfwidth.learn import learn as learn
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
+    from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
+    from halfwidth.methods.particle import ParticleFilter as ParticleFilter
     from halfwidth.model import Linear as Linear
     from halfwidth.model import Nonlinear as Nonlinear
     from halfwidth.noise import Gaussian as Gaussian

@@ -557,3 +557,18 @@ def test_row_by_row_equals_the_record():
         np.testing.assert_allclose(x, batch.x[-1], rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(P, batch.P[-1], rtol=1e-10, atol=1e-12)
         assert loglik == pytest.approx(batch.loglik, rel=1e-12)
+
+
+def test_a_nonlinear_model_is_smoothed_by_default():
+    _, record = drive(ctrv(), 4, T=30)
+    est = hw.estimate(ctrv(), record)
+    assert est.method == "UnscentedKalman(smooth=True)"
+    np.testing.assert_array_equal(est.x, hw.estimate(ctrv(), record, UnscentedKalman(smooth=True)).x)
+
+
+def test_many_records_and_frames():
+    _, one = drive(ctrv(), 4, T=30)
+    _, two = drive(ctrv(), 5, T=20)
+    several = hw.estimate(ctrv(), [one, two], UnscentedKalman())
+    for record, est in zip([one, two], several, strict=True):
+        np.testing.assert_array_equal(est.x, hw.estimate(ctrv(), record, UnscentedKalman()).x)

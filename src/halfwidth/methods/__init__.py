@@ -10,6 +10,7 @@ ESTIMATORS: dict[str, str] = {
     "ExtendedKalman": "nonlinear",
     "UnscentedKalman": "nonlinear",
     "ParticleFilter": "particle",
+    "BatchLP": "map",
 }
 
 

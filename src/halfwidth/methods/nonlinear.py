@@ -1,11 +1,11 @@
 """Extended and unscented Kalman filter and smoother for nonlinear models with Gaussian noise.
 
-``x[t] = g(x[t-1], u[t]) + w[t]``,  ``y[t] = h(x[t]) + e[t]``. The extended filter linearises g and h at the estimate [1]_;
-the unscented filter carries sigma points through them [2]_. With ``smooth=True`` a Rauch-Tung-Striebel pass uses the
-whole record. ``g`` and ``h`` are recorded once a run and then run compiled, the whole record in C++; where that is not
-possible the same algorithm runs in NumPy. ``info["evaluated"]`` says which, ``info["reason"]`` why; ``info["nis"]`` is the
-normalised square of each row's innovation, ``info["x0"]`` and ``info["P0"]`` the smoothed state one step before the first
-row.
+``x[t] = g(x[t-1], u[t]) + w[t]``, ``y[t] = h(x[t]) + e[t]``. The extended filter linearises g and h at the estimate
+[1]_; the unscented filter carries sigma points through them [2]_. With ``smooth=True`` a Rauch-Tung-Striebel pass
+uses the whole record. ``g`` and ``h`` are recorded once a run and then run compiled, the whole record in C++; where
+that is not possible the same algorithm runs in NumPy. ``info["evaluated"]`` says which, ``info["reason"]`` why;
+``info["nis"]`` is the normalised square of each row's innovation, ``info["x0"]`` and ``info["P0"]`` the smoothed
+state one step before the first row.
 
 References
 ----------
@@ -188,7 +188,7 @@ class _Rows(NamedTuple):
         return tuple(None if a is None else float(a[k]) if a.ndim == 1 else a[k] for a in self.more)
 
     def columns(self) -> Array:
-        """The same as one matrix (T, number of inputs)."""
+        """Return the same as one matrix (T, number of inputs)."""
         blocks = [a.reshape(len(self.t), -1) for a in self.more if a is not None]
         return np.ascontiguousarray(np.concatenate(blocks, axis=1)) if blocks else np.empty((len(self.t), 0))
 
@@ -207,7 +207,7 @@ def _refuses(method: Method, model: Model) -> str | None:
     if model.bounds is not None:
         return f"`{name}` cannot keep `bounds`\nhint: model.as_gaussian() drops them, ParticleFilter() keeps them"
     if model.loss is not None:
-        return f"`{name}` cannot tell losses from outputs\nhint: ParticleFilter() on a model without `loss`, NaN where lost"
+        return f"`{name}` cannot tell losses from outputs\nhint: a model without `loss`, and NaN where y was lost"
     return None
 
 
