@@ -139,7 +139,7 @@ def solve(
         psi = np.where(np.isfinite(found), found, psi)
         if learn and k < settings.rounds - 1:
             s2 = _learnt(rows, line, out, s2)
-    return [_fit(rows, out, s2[i], i, drive) for i, drive in enumerate(drives)]
+    return [_fit(rows, out, s2[i], i, drive, settings) for i, drive in enumerate(drives)]
 
 
 def azimuth_of(drive: Grid) -> Floats:
@@ -302,6 +302,7 @@ def _linearised(rows: _Rows, psi: Floats) -> _Line:
     h, v, w = rows.h, rows.v, rows.w
     middle = psi.copy()
     middle[1:] = 0.5 * (psi[1:] + psi[:-1])
+    middle[rows.first] = psi[rows.first]
     S, C, vh = np.sin(middle), np.cos(middle), v * h
     A = np.zeros((h.size, 7, 7))
     A[:, range(7), range(7)] = 1.0
@@ -425,7 +426,7 @@ def _learnt(rows: _Rows, line: _Line, out: _Smoothed, s2: Floats) -> Floats:
     return np.clip(new, _FLOOR**2, _CEILING**2)
 
 
-def _fit(rows: _Rows, out: _Smoothed, s2: Floats, i: int, drive: Grid) -> Fit:
+def _fit(rows: _Rows, out: _Smoothed, s2: Floats, i: int, drive: Grid, settings: Chain) -> Fit:
     part = slice(int(rows.offsets[i]), int(rows.offsets[i + 1]))
     z, P = out.x[part].copy(), out.P[part]
     z[:, [E, N]] += rows.origin[i]
@@ -440,6 +441,7 @@ def _fit(rows: _Rows, out: _Smoothed, s2: Floats, i: int, drive: Grid) -> Fit:
         "sigma": dict(zip(GROUPS, (float(s) for s in sigma), strict=True)),
         "speed_scale": float(np.mean(z[:, SCALE])),
         "yaw_bias": float(np.mean(z[:, BIAS])),
+        "slow_sd": float(np.sqrt(0.5 * settings.memory * s2[3])),
     }
     path = Path(
         drive.t,

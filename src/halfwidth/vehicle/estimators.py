@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from halfwidth.errors import BadValue
 from halfwidth.estimate import estimate
 from halfwidth.methods import load
-from halfwidth.model import Linear
+from halfwidth.model import Linear, Nonlinear
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
-from halfwidth.result import Status
+from halfwidth.result import Estimate, Status
 from halfwidth.spread import Normal
 from halfwidth.vehicle import chain, models
 from halfwidth.vehicle.frames import wrapped
@@ -182,41 +182,49 @@ def _white(h: Floats, q: float) -> Floats:
     return q**2 * Q
 
 
-def _moving(drive: Grid, q: float, r: float, driven: bool) -> tuple[Linear, Record, Floats]:
-    """Return the Gaussian constant-velocity model of a drive, with or without its acceleration, and its record."""
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """A drive as a record of fixes about its first one."""
+
+    record: Record
+    origin: Floats
+    far: float  # how far the first node may be from the first fix, m
+
+
+def _case(drive: Grid, u: Floats | None, *sensors: Floats) -> _Case:
+    y, origin = _fixes(drive)
+    far = 100.0 + _pace(drive) * float(drive.t[int(np.argmax(drive.seen))] - drive.t[0])
+    return _Case(Record(drive.t, np.column_stack((y, *sensors)), u), origin, far)
+
+
+def _path(drive: Grid, case: _Case, est: Estimate, azimuth: Floats, speed: Floats, tuned: Tuned) -> Path:
+    """Return the path of an estimate whose first two states are east and north about the origin."""
+    P = est.P
+    variance = None if P is None else np.column_stack((P[:, 0, 0], P[:, 1, 1]))
+    east, north = est.x[:, 0] + case.origin[0], est.x[:, 1] + case.origin[1]
+    info = {**tuned, "q": est.q, "r": est.r}
+    return Path(drive.t, east, north, azimuth, speed, variance, tuned.get("fix", 0.0) ** 2, est.status, info)
+
+
+def _moving(drive: Grid, case: _Case, q: float, r: float) -> Linear:
+    """Return the Gaussian constant-velocity model of a drive, with an acceleration where its record has one."""
     h = drive.h.copy()
     h[0] = 1e-3  # the prior is of the first node, not of one step before it
-    y, origin = _fixes(drive)
-    far = 100.0 + _pace(drive) * (drive.t[int(np.argmax(drive.seen))] - drive.t[0])
-    x0 = Normal(np.zeros(4), np.array([far**2, far**2, 900.0, 900.0]))
-    model = models.constant_velocity(h, Gaussian(_white(h, q)), Gaussian([r**2, r**2]), x0=x0, acceleration=driven)
-    return model, Record(drive.t, y, _acceleration(drive) if driven else None), origin
+    x0 = Normal(np.zeros(4), np.array([case.far**2, case.far**2, 900.0, 900.0]))
+    driven = case.record.u is not None
+    return models.constant_velocity(h, Gaussian(_white(h, q)), Gaussian([r**2, r**2]), x0=x0, acceleration=driven)
 
 
 def _smoothed(driven: bool) -> Callable[[Sequence[Grid], Tuned], list[Path]]:
     def run(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
         paths = []
         for drive in drives:
-            model, record, origin = _moving(drive, tuned["acceleration"], tuned["fix"], driven)
-            est = estimate(model, record, load("KalmanSmoother")())
-            x, P = est.x, est.P
-            assert P is not None
-            velocity = np.hypot(x[:, 2], x[:, 3])
-            azimuth = np.unwrap(np.arctan2(x[:, 2], x[:, 3]))
-            variance = np.column_stack((P[:, 0, 0], P[:, 1, 1]))
-            paths.append(
-                Path(
-                    drive.t,
-                    x[:, 0] + origin[0],
-                    x[:, 1] + origin[1],
-                    azimuth,
-                    velocity,
-                    variance,
-                    tuned["fix"] ** 2,
-                    est.status,
-                    dict(tuned),
-                )
-            )
+            case = _case(drive, _acceleration(drive) if driven else None)
+            model = _moving(drive, case, tuned["acceleration"], tuned["fix"])
+            est = estimate(model, case.record, load("KalmanSmoother")())
+            velocity = est.x[:, 2:]
+            azimuth = np.unwrap(np.arctan2(velocity[:, 0], velocity[:, 1]))
+            paths.append(_path(drive, case, est, azimuth, np.hypot(velocity[:, 0], velocity[:, 1]), tuned))
         return paths
 
     return run
@@ -224,15 +232,20 @@ def _smoothed(driven: bool) -> Callable[[Sequence[Grid], Tuned], list[Path]]:
 
 def _tuned(driven: bool) -> Callable[[Grid], Tuned]:
     def tune(drive: Grid) -> Tuned:
+        case = _case(drive, _acceleration(drive) if driven else None)
+
         def loglik(log_scales: Floats) -> float:
             q, r = np.exp(log_scales)
-            model, record, _ = _moving(drive, float(q), float(r), driven)
-            return float(estimate(model, record, load("KalmanFilter")()).loglik or -np.inf)
+            return _loglik(estimate(_moving(drive, case, float(q), float(r)), case.record, load("KalmanFilter")()))
 
         q, r = np.exp(_climb(loglik, np.log([0.5, 0.5]), np.log([1e-3, 1e-2]), np.log([10.0, 30.0])))
         return {"acceleration": float(q), "fix": float(r)}
 
     return tune
+
+
+def _loglik(est: Estimate) -> float:
+    return float(est.loglik) if est.status.good and est.loglik is not None else -np.inf
 
 
 def _climb(f: Callable[[Floats], float], start: Floats, lo: Floats, hi: Floats) -> Floats:
@@ -258,52 +271,42 @@ def _climb(f: Callable[[Floats], float], start: Floats, lo: Floats, hi: Floats) 
 _CTRV_START = {"speed": 0.5, "yaw_rate": 0.1, "fix": 0.3, "speed_sensor": 0.1, "yaw_sensor": 0.01}
 
 
-def _ctrv(drive: Grid, tuned: Tuned) -> tuple[Any, Record, Floats]:
-    """Return the seven-state model and the record (positions, speed, yaw rate) of a drive."""
+def _ctrv(drive: Grid, case: _Case, tuned: Tuned) -> Nonlinear:
+    """Return the seven-state model of a drive; its record has positions, speed and yaw rate."""
     h = float(np.median(drive.h))
-    y, origin = _fixes(drive)
-    # sensors are means over the step before: half a step old at the node, so the next step counts as well
-    speed, turn = (0.5 * (s + np.concatenate((s[1:], s[-1:]))) for s in (drive.speed, drive.yaw_rate))
-    first = chain.azimuth_of(drive)
-    far = 100.0 + _pace(drive) * (drive.t[int(np.argmax(drive.seen))] - drive.t[0])
-    x0 = Normal([0.0, 0.0, first[0], speed[0], turn[0], 1.0, 0.0], [far**2, far**2, 0.25, 4.0, 0.04, 9e-4, 1e-4])
+    y = case.record.y[0]
+    mean = [0.0, 0.0, tuned["azimuth"], y[2], y[3], 1.0, 0.0]
+    x0 = Normal(mean, [case.far**2, case.far**2, 0.25, 4.0, 0.04, 9e-4, 1e-4])
     Q = np.array([1e-4, 1e-4, 1e-6, tuned["speed"] ** 2, tuned["yaw_rate"] ** 2, 1e-8, 1e-10]) * h
     R = np.array([tuned["fix"], tuned["fix"], tuned["speed_sensor"], tuned["yaw_sensor"]]) ** 2
-    model = models.ctrv(Gaussian(Q), Gaussian(R), x0=x0, theta=True)
-    return model, Record(drive.t, np.column_stack((y, speed, turn))), origin
+    return models.ctrv(Gaussian(Q), Gaussian(R), x0=x0, theta=True)
+
+
+def _ctrv_case(drive: Grid) -> _Case:
+    # sensors are means over the step before: half a step old at the node, so the next step counts as well
+    speed, turn = (0.5 * (s + np.concatenate((s[1:], s[-1:]))) for s in (drive.speed, drive.yaw_rate))
+    return _case(drive, None, speed, turn)
 
 
 def _turning(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
     paths = []
     for drive in drives:
-        model, record, origin = _ctrv(drive, tuned)
-        est = estimate(model, record, load("ExtendedKalman")(smooth=True))
-        x, P = est.x, est.P
-        assert P is not None
-        variance = np.column_stack((P[:, 0, 0], P[:, 1, 1]))
-        paths.append(
-            Path(
-                drive.t,
-                x[:, 0] + origin[0],
-                x[:, 1] + origin[1],
-                x[:, 2],
-                x[:, 3],
-                variance,
-                tuned["fix"] ** 2,
-                est.status,
-                dict(tuned),
-            )
-        )
+        case = _ctrv_case(drive)
+        model = _ctrv(drive, case, {**tuned, "azimuth": float(chain.azimuth_of(drive)[0])})
+        est = estimate(model, case.record, load("ExtendedKalman")(smooth=True))
+        paths.append(_path(drive, case, est, est.x[:, 2], est.x[:, 3], tuned))
     return paths
 
 
 def _tuned_ctrv(drive: Grid) -> Tuned:
-    names = list(_CTRV_START)
+    names, case = list(_CTRV_START), _ctrv_case(drive)
+    azimuth = float(chain.azimuth_of(drive)[0])
 
     def loglik(log_scales: Floats) -> float:
-        model, record, _ = _ctrv(drive, dict(zip(names, np.exp(log_scales), strict=True)))
-        est = estimate(model, record, load("ExtendedKalman")())
-        return float(est.loglik) if est.status.good and est.loglik is not None else -np.inf
+        scales = dict(zip(names, (float(v) for v in np.exp(log_scales)), strict=True))
+        return _loglik(
+            estimate(_ctrv(drive, case, {**scales, "azimuth": azimuth}), case.record, load("ExtendedKalman")())
+        )
 
     start = np.log(list(_CTRV_START.values()))
     found = _climb(loglik, start, start - np.log(50.0), start + np.log(30.0))
@@ -313,30 +316,26 @@ def _tuned_ctrv(drive: Grid) -> Tuned:
 # ---- unknown half-widths -------------------------------------------------------------------------------------------
 
 
-def _programme(build: Callable[[Grid], tuple[Linear, Record, Floats]], **settings: Any) -> Any:
-    def run(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:  # noqa: ARG001
+def _programme(build: Callable[[Grid], tuple[Linear, Floats]], **settings: Any) -> Any:
+    def run(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
         paths = []
         for drive in drives:
-            model, record, origin = build(drive)
-            est = estimate(model, record, load("BatchLP")(**settings))
-            azimuth = chain.azimuth_of(drive)
-            info = {"q": est.q, "r": est.r}
-            east, north = est.x[:, 0] + origin[0], est.x[:, 1] + origin[1]
-            paths.append(Path(drive.t, east, north, azimuth, drive.speed, None, 0.0, est.status, info))
+            model, u = build(drive)
+            case = _case(drive, u)
+            est = estimate(model, case.record, load("BatchLP")(**settings))
+            paths.append(_path(drive, case, est, chain.azimuth_of(drive), drive.speed, tuned))
         return paths
 
     return run
 
 
-def _ins(drive: Grid) -> tuple[Linear, Record, Floats]:
-    y, origin = _fixes(drive)
-    return models.gps_ins(drive.h), Record(drive.t, y, _acceleration(drive)), origin
+def _ins(drive: Grid) -> tuple[Linear, Floats]:
+    return models.gps_ins(drive.h), _acceleration(drive)
 
 
-def _two_antenna(drive: Grid) -> tuple[Linear, Record, Floats]:
-    y, origin = _fixes(drive)
+def _two_antenna(drive: Grid) -> tuple[Linear, Floats]:
     moved = models.displacement(chain.azimuth_of(drive), drive.speed, drive.h)
-    return models.two_antenna_linear(antennas=1), Record(drive.t, y, moved), origin
+    return models.two_antenna_linear(antennas=1), moved
 
 
 # ---- the chain -----------------------------------------------------------------------------------------------------

@@ -3,8 +3,13 @@
 The log is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
 gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened by what
 hiding the log's own fixes shows (`calibrate`). A method that fails on a piece is replaced by a simpler one there, and
-the track says so. Positions are those that the receiver would have reported: an error that the receiver carries along
-for minutes is in the fixes on both sides of a gap and in the filling between them, and no half-width shows it.
+the track says so.
+
+Positions are those that the receiver would have reported. What it is wrong by for minutes at a time is in the fixes on
+both sides of a gap and in the filling between them, and hiding fixes cannot show it. The chain learns how large that
+slow error is (its fix offset), and the half-widths have it added:
+
+    half = z sqrt(inflation^2 (variance of the path + variance of a fix) + variance of the slow error)
 """
 
 import os
@@ -242,6 +247,10 @@ def _distance_in_time(log: Log, t: Floats) -> tuple[Floats, Floats]:
     return away, length
 
 
+#: Names of what the chain finds, as the settings of a track have them.
+_WORDS = {"speed_scale": "speed scale", "yaw_bias": "yaw bias", "slow_sd": "slow error of the fixes"}
+
+
 # ---- estimating ----------------------------------------------------------------------------------------------------
 
 #: Fills drives of which fixes were hidden; the numbers say which grid each comes from.
@@ -264,7 +273,7 @@ def _estimated(
     """Estimate every piece, with simpler methods where the chosen one fails, and test the intervals."""
     grids = [piece.grid for piece in pieces]
     able = [i for i, grid in enumerate(grids) if chosen.name == "linear" or int(grid.seen.sum()) >= FEWEST]
-    found, rerun, settings = _chain(grids, able) if chosen.name == "em" else _plain(chosen, grids, able)
+    found, rerun, settings = _chain(grids, able, messages) if chosen.name == "em" else _plain(chosen, grids, able)
     failed = [i for i in range(len(grids)) if i not in found or not _plausible(found[i], grids[i])]
     if failed and chosen.name != "linear":
         messages.append(_failed_words(chosen, [pieces[i] for i in failed], len(pieces)))
@@ -287,7 +296,9 @@ def _estimated(
     return _Answers(paths, tested, 1.0 if claimed else 0.0, settings)
 
 
-def _chain(grids: Sequence[Grid], able: Sequence[int]) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
+def _chain(
+    grids: Sequence[Grid], able: Sequence[int], messages: list[str]
+) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
     """Solve the chain for the pieces that have enough fixes."""
     fits = dict(zip(able, chain.solve([grids[i] for i in able]), strict=True))
 
@@ -310,9 +321,14 @@ def _chain(grids: Sequence[Grid], able: Sequence[int]) -> tuple[dict[int, Path],
         settings.update(
             {f"{name} noise": float(f"{value:.3g}") for name, value in zip(chain.GROUPS, sigma, strict=True)}
         )
-        for name in ("speed_scale", "yaw_bias"):
+        for name in ("speed_scale", "yaw_bias", "slow_sd"):
             value = np.average([fit.path.info[name] for fit in fits.values()], weights=weight)
-            settings[_words(name)] = float(f"{value:.4g}")
+            settings[_WORDS[name]] = float(f"{value:.4g}")
+        slow = float(np.average([fit.path.info["slow_sd"] for fit in fits.values()], weights=weight))
+        messages.append(
+            f"the fixes are taken to be wrong by {slow:.2g} m for minutes at a time (1 sigma, learnt from the drive);"
+            " the half-widths have it added"
+        )
     return {i: fit.path for i, fit in fits.items()}, rerun, settings
 
 
@@ -436,12 +452,13 @@ class _Columns:
     speed: Floats
     variance: Floats  # (M, 2)
     fix_variance: Floats  # (M,)
+    slow_variance: Floats  # (M,)
 
 
 def _read(answers: _Answers, pieces: Sequence[_Piece], t: Floats) -> _Columns:
     """Read each row off the path of its piece."""
     east, north, azimuth, speed_at = (np.full(t.size, np.nan) for _ in range(4))
-    columns = _Columns(east, north, azimuth, speed_at, np.zeros((t.size, 2)), np.zeros(t.size))
+    columns = _Columns(east, north, azimuth, speed_at, np.zeros((t.size, 2)), np.zeros(t.size), np.zeros(t.size))
     starts = np.array([piece.start for piece in pieces])
     of = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(pieces) - 1)
     for i, path in enumerate(answers.paths):
@@ -461,6 +478,7 @@ def _read(answers: _Answers, pieces: Sequence[_Piece], t: Floats) -> _Columns:
         for j in (0, 1):
             columns.variance[rows, j] = np.interp(at, path.t, variance[:, j])
         columns.fix_variance[rows] = path.fix_variance
+        columns.slow_variance[rows] = path.info.get("slow_sd", 0.0) ** 2
     return columns
 
 
@@ -487,9 +505,10 @@ def _half_widths(
     factor = np.ones(away.size)
     empty = quality != "fix"
     factor[empty] = calibrate.inflation(answers.tested, length[empty], least=answers.least)
-    half = z * factor[:, None] * np.sqrt(columns.variance + columns.fix_variance[:, None])
+    quick = factor[:, None] ** 2 * (columns.variance + columns.fix_variance[:, None])
+    half = z * np.sqrt(quick + columns.slow_variance[:, None])
     # twice: both the estimate and the vehicle are within reach of the nearest fix
-    limit = 2 * _top_speed(grid) * away + z * np.sqrt(columns.fix_variance) + 10.0
+    limit = 2 * _top_speed(grid) * away + z * np.sqrt(columns.fix_variance + columns.slow_variance) + 10.0
     return np.minimum(half, limit[:, None])
 
 
