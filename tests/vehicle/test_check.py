@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from tests.vehicle.drives import drive, save
 
 import halfwidth as hw
 from halfwidth.vehicle.check import quantisation
-from tests.vehicle.drives import drive, save
 
 
 def checked(tmp_path, **changes):

@@ -5,12 +5,12 @@ import sys
 
 import numpy as np
 import pytest
+from tests.vehicle.drives import drive, save, text
 
 import halfwidth as hw
 from halfwidth.vehicle import evidence
 from halfwidth.vehicle.formats import layout
 from halfwidth.vehicle.log import STREAMS
-from tests.vehicle.drives import drive, save, text
 
 TRUE = drive()
 
