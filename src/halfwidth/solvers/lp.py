@@ -19,6 +19,9 @@ point and a direction of descent that no row stops. Otherwise the next solver is
 end the verdict says `FAILED`, or `REDUCED` for a point that is good to 1e-5 only. So a sloppy,
 broken or lying solver can cost time, never a wrong answer.
 
+A point that is nearly optimal is polished first: the equations of the rows and boxes that look active are solved, and the
+better point is kept. A small program whose optimum is too flat to polish gets the next solver's opinion, too.
+
 Adding a solver: write a function from a `Program` to a `Claim` and put ``Solver(name, function)``
 into the tuple given to `solve`. Its multipliers follow the sign above: z > 0 prices a row at its
 lower end, z < 0 at its upper end. With ``balanced=False`` it is given the program as it was built,
@@ -388,8 +391,8 @@ def _proof(program: Program, z: Array) -> Array | None:
     top = _largest(np.abs(z))
     if not 0.0 < top < np.inf:
         return None
-    z = _cleaned(program, np.where(np.abs(z) > 1e-9 * top, z, 0.0) / top, np.zeros(program.c.size))
-    return z if z is not None and certifies(program, z) else None
+    exact = _cleaned(program, np.where(np.abs(z) > 1e-9 * top, z, 0.0) / top, np.zeros(program.c.size))
+    return exact if exact is not None and certifies(program, exact) else None
 
 
 def _cleaned(program: Program, z: Array, slope: Array) -> Array | None:
