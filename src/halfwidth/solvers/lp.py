@@ -19,8 +19,9 @@ point and a direction of descent that no row stops. Otherwise the next solver is
 end the verdict says `FAILED`, or `REDUCED` for a point that is good to 1e-5 only. So a sloppy,
 broken or lying solver can cost time, never a wrong answer.
 
-A point that is nearly optimal is polished first: the equations of the rows and boxes that look active are solved, and the
-better point is kept. A small program whose optimum is too flat to polish gets the next solver's opinion, too.
+A point that is nearly optimal is polished first: the equations of the rows and boxes that look
+active are solved, and the better point is kept. A small program whose optimum is too flat to
+polish gets the opinion of the next solver, too.
 
 Adding a solver: write a function from a `Program` to a `Claim` and put ``Solver(name, function)``
 into the tuple given to `solve`. Its multipliers follow the sign above: z > 0 prices a row at its
