@@ -264,7 +264,7 @@ def solve(program: Program, solvers: Sequence[Solver] | None = None) -> Solution
     scaled = _Scaled(program)
     notes: list[str] = []
     found = scaled.ask(solvers, notes)
-    if found.verdict in (Verdict.FAILED, Verdict.REDUCED):
+    if found.verdict is Verdict.FAILED:
         proof = _elastic_proof(scaled.program, solvers, notes)
         found = found if proof is None else proof
     x = None if found.x is None else np.clip(scaled.x * found.x, program.lo, program.hi)
