@@ -63,9 +63,7 @@ def limit():
     """Compile the hand-written loop."""
     folder = tempfile.mkdtemp()
     library = os.path.join(folder, "limit.so")
-    subprocess.run(
-        ["g++", "-O3", "-shared", "-fPIC", "-o", library, str(HERE / "kalman_limit.cpp")], check=True
-    )
+    subprocess.run(["g++", "-O3", "-shared", "-fPIC", "-o", library, str(HERE / "kalman_limit.cpp")], check=True)
     call = ctypes.CDLL(library).kf_rts
     call.restype = ctypes.c_double
     return call
@@ -86,6 +84,7 @@ class Loop:
         self.single = [np.ascontiguousarray(m) for m in single]
 
     def __call__(self, first=0, rows=None):
+        """Filter and smooth `rows` rows from `first` on and return the log-likelihood."""
         def at(a):
             return ctypes.c_void_p(a.ctypes.data + first * a.strides[0])
 
@@ -106,14 +105,14 @@ def constant_velocity(dt=1.0):
 
 
 def drawn(model, T, seed=0, lost=0.3):
-    """A record with a share of its rows missing."""
+    """Draw a record with a share of its rows missing."""
     _, record = hw.simulate(model, T=T, seed=seed)
     rows = np.random.default_rng(seed + 1).random(T) >= lost
     return hw.Record(record.t, np.where(rows[:, None], record.y, np.nan)), rows
 
 
 def statsmodels_smoother(model, y):
-    """The statespace smoother of statsmodels, its prior moved one step ahead."""
+    """Return the smoother of statsmodels, its prior moved one step ahead."""
     from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
     A, Q = model.A.single, model.w.cov().single
@@ -133,9 +132,7 @@ def kalman():
     loop = Loop(model, record.y, rows)
     method = hw.KalmanSmoother()
     loglik, est = loop(), hw.estimate(model, record, method)
-    error = max(
-        difference(est.x, loop.x[2]), difference(est.P, loop.P[2]), abs(est.loglik / loglik - 1.0)
-    )
+    error = max(difference(est.x, loop.x[2]), difference(est.P, loop.P[2]), abs(est.loglik / loglik - 1.0))
     ours, hand = best(lambda: hw.estimate(model, record, method), loop, repeats=15)
     lines = [
         ("", "ms", "ns a step", "x C++ loop", "error"),
@@ -149,7 +146,9 @@ def kalman():
         out = ss.smooth()
         error = max(difference(out.smoothed_state.T, loop.x[2]), difference(out.smoothed_state_cov.T, loop.P[2]))
         slow, hand = best(ss.smooth, loop, repeats=3)
-        lines.append(("statsmodels", f"{slow * 1e3:.0f}", f"{slow / T * 1e9:.0f}", f"{slow / hand:.1f}", f"{error:.0e}"))
+        lines.append(
+            ("statsmodels", f"{slow * 1e3:.0f}", f"{slow / T * 1e9:.0f}", f"{slow / hand:.1f}", f"{error:.0e}")
+        )
         lines.append(("statsmodels / halfwidth", f"{slow / ours:.0f} x", "", "", ""))
     table(f"KF + RTS, T = {T:,}, n = 4, m = 2, 30 % of the rows missing", lines)
 
@@ -232,17 +231,25 @@ def stream():
         return live.push(row).x
 
     lines.append(("halfwidth, push and read x", f"{latency(read, lists):.2f}", ""))
-    if peer("fast_kalman"):
-        import fast_kalman
+    if peer("kalman"):  # the package fast-kalman
+        import kalman as fast
 
-        kf = fast_kalman.KalmanFilter(4, 2)
-        names = [n for n in dir(kf) if not n.startswith("_")]
-        step = _fast_kalman(kf, model, names)
-        if step is not None:
-            for row in lists:
-                out = step(row)
-            error = difference(np.asarray(out).ravel()[:4], batch.x[-1])
-            lines.append(("fast-kalman, predict and update of lists", f"{latency(step, lists):.2f}", f"{error:.0e}"))
+        A, Q = model.A.single, model.w.cov().single
+        flat = [m.ravel().tolist() for m in (A, Q, model.C.single, model.e.cov().single)]
+        start = (A @ model.x0.mean).tolist(), (A @ model.x0.P @ A.T + Q).ravel().tolist()
+        kf = fast.LinearKalmanFilter(4, 2, *start, *flat)
+        # it updates first, so our prior is moved one step ahead and the update comes before the prediction
+        for row in lists:
+            kf.predict() if row is not lists[0] else None
+            kf.correct(row)
+        error = difference(np.ravel(kf.x()), batch.x[-1])
+
+        def theirs(row):
+            kf.predict()
+            kf.correct(row)
+
+        lines.append(("fast-kalman, predict and correct of lists", f"{latency(theirs, lists):.2f}", f"{error:.0e}"))
+        lines.append(("fast-kalman, update of lists", f"{latency(kf.update, lists):.2f}", ""))
     table("One online step, n = 4, m = 2: median of wall times", lines)
 
 
@@ -290,7 +297,12 @@ def learn():
             kf = theirs()
             (slow,) = best(theirs, repeats=1)
         at = hw.Linear(
-            truth.A, None, truth.C, hw.Gaussian(kf.transition_covariance), hw.Gaussian(kf.observation_covariance), truth.x0
+            truth.A,
+            None,
+            truth.C,
+            hw.Gaussian(kf.transition_covariance),
+            hw.Gaussian(kf.observation_covariance),
+            truth.x0,
         )
         reached = hw.estimate(at, record, hw.KalmanFilter()).loglik
         row(f"pykalman, {n_iter} EM iterations, Q and R full", slow, reached, np.asarray(kf.observation_covariance))
@@ -310,12 +322,12 @@ def growth():
     long, _ = drawn(model, 1_000_000, seed=3)
     a, b = best(lambda: hw.estimate(model, short, method), lambda: hw.estimate(model, long, method), repeats=5)
     code = (
-        "import numpy as np, sys; sys.path.insert(0, {here!r}); import speed, halfwidth as hw\n"
+        f"import numpy as np, sys; sys.path.insert(0, {str(HERE)!r}); import speed, halfwidth as hw\n"
         "def status(key): return int(open('/proc/self/status').read().split(key)[1].split()[0]) * 1024\n"
         "m = speed.constant_velocity(); r, _ = speed.drawn(m, 10); hw.estimate(m, r)\n"
         "T = 1000000; r = hw.Record(np.arange(1.0, T + 1), np.zeros((T, 2)))\n"
         "before = status('VmRSS:'); e = hw.estimate(m, r); print((status('VmHWM:') - before) / T)"
-    ).format(here=str(HERE))
+    )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     table(
         "From T = 100,000 to T = 1,000,000",
