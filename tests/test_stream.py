@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from tests import naive
 from tests.cases import constant_velocity, oscillator
 
 import halfwidth as hw
@@ -169,8 +171,8 @@ def test_a_varying_model_is_given_to_resume():
         hw.resume(saved)
     again = hw.resume(saved, model)
     np.testing.assert_array_equal(again.push(None, dt=0.3).x, live.push(None, dt=0.3).x)
-    batch = hw.estimate(model, hw.Record(np.cumsum(steps), np.tile([1.0, 2.0], (4, 1))), hw.KalmanFilter())
     other = dataclasses.replace(model, dt=0.1)
+    batch = hw.estimate(other, hw.Record(np.cumsum(steps), np.tile([1.0, 2.0], (4, 1))), hw.KalmanFilter())
     np.testing.assert_allclose(batch.x[-1], hw.resume(saved, other).push(None, dt=1e-9).x[0], atol=1e-6)
 
 
@@ -247,3 +249,62 @@ def test_snapshot_holds_plain_data():
     head = json.loads(saved[20 : 20 + size])
     assert head["method"] == ["KalmanSmoother", {"lag": 2}]
     assert head["sizes"] == [3, 2, 1]
+
+
+class Belief(NamedTuple):
+    x: np.ndarray
+    P: np.ndarray
+    loglik: float
+    rows: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Stepwise:
+    """The filter as a recursive method in Python."""
+
+    def refuses(self, model):
+        return None
+
+    def run(self, model, record, *, seed=None):
+        from halfwidth.methods._protocol import scan
+
+        return scan(self, model, record)
+
+    def init(self, model):
+        return Belief(model.x0.mean, model.x0.P, 0.0, 0)
+
+    def step(self, model, state, y, u, t, dt):
+        A, C = model.A.single, model.C.single
+        s = ~np.isnan(y)
+        args = A, None, C, model.w.cov().single, model.e.cov().single, y[None], s[None], state.x, state.P
+        x, P, _, _, ll = naive.kf(*args)
+        return Belief(x[0], P[0], state.loglik + float(ll[0]), state.rows + 1)
+
+    def belief(self, model, state):
+        return state.x, state.P, state.loglik
+
+
+def test_any_recursive_method_runs_and_resumes(monkeypatch):
+    from halfwidth import methods
+
+    load = methods.load
+    monkeypatch.setitem(methods.ESTIMATORS, "Stepwise", "nowhere")
+    monkeypatch.setattr(methods, "load", lambda name: Stepwise if name == "Stepwise" else load(name))
+    model = constant_velocity()
+    record = drive(model)
+    want = hw.estimate(model, record, hw.KalmanFilter())
+    assert hw.estimate(model, record, Stepwise()).loglik == pytest.approx(want.loglik)
+    live = hw.stream(model, Stepwise())
+    for k, y in enumerate(record.y):
+        if k == 20:
+            live = hw.resume(live.snapshot())
+        newest = live.push(y)
+        np.testing.assert_allclose(newest.x[0], want.x[k], rtol=1e-9, atol=1e-12)
+    assert newest.loglik == pytest.approx(want.loglik)
+    assert newest.method == "Stepwise()"
+    assert live.rows == 40
+    for bad in ([1.0], [np.inf, 0.0]):
+        with pytest.raises(hw.BadRecord):
+            live.push(bad)
+    with pytest.raises(hw.BadRecord, match="`dt`"):
+        live.push(None, dt=-1.0)
