@@ -65,8 +65,8 @@ _STATUS = {
     Verdict.REDUCED: Status.REDUCED,
     Verdict.INFEASIBLE: Status.INFEASIBLE,
 }
-#: Share of sigma, or of itself if larger, by which an optimal half-width is widened for the least-squares stage, and what
-#: is tried next where that leaves too little room.
+#: Share of sigma, or of itself if larger, by which an optimal half-width is widened for the least-squares stage; the
+#: second where the first leaves too little room.
 _RELAX = (1e-6, 1e-4)
 #: Residuals, half-widths and excesses below this share of sigma count as 0.
 _ZERO = 1e-5
@@ -87,7 +87,7 @@ class BatchLP:
         half-width, since it has no minimum otherwise.
     point : {"least_squares", "optimal"}
         Which trajectory of the optimal face: that of least squares in units of sigma, inside the optimal half-widths
-        widened by 1e-6 of sigma; or the one the solver happens to return.
+        widened by 1e-6 of sigma (1e-4 where that leaves too little room); or the one the solver happens to return.
     grow_caps : bool
         Where the caps ``at_most`` of unknown half-widths leave no trajectory, double them until one fits (step 7 of
         the paper's algorithm); ``info["caps_grown"]`` says how often.
