@@ -242,7 +242,7 @@ def stream():
         for row in lists:
             kf.predict() if row is not lists[0] else None
             kf.correct(row)
-        error = difference(np.ravel(kf.x()), batch.x[-1])
+        error = difference(np.ravel(kf.x), batch.x[-1])
 
         def theirs(row):
             kf.predict()
