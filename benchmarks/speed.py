@@ -85,6 +85,7 @@ class Loop:
 
     def __call__(self, first=0, rows=None):
         """Filter and smooth `rows` rows from `first` on and return the log-likelihood."""
+
         def at(a):
             return ctypes.c_void_p(a.ctypes.data + first * a.strides[0])
 

@@ -113,7 +113,7 @@ def learn(
     --------
     >>> import halfwidth as hw
     >>> walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(1.0), hw.Gaussian(4.0), hw.Normal([0.0], 1.0))
-    >>> _, record = hw.simulate(walk, T=500, seed=1)
+    >>> _, record = hw.simulate(walk, T=5000, seed=1)
     >>> guess = hw.Linear([[1]], None, [[1]], hw.Gaussian(0.1), hw.Gaussian(0.1), walk.x0)
     >>> hw.learn(guess, record).check().model.e.cov().single.round(0)
     array([[4.]])
