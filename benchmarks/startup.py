@@ -49,17 +49,16 @@ def main() -> None:
         log, track, report = (str(Path(folder) / name) for name in ("drive.csv", "track.gpx", "report.html"))
         subprocess.run([python, "-m", "halfwidth", "demo", "-o", folder, "--force", "-q"], check=True,
                        stdout=subprocess.DEVNULL)  # fmt: skip
-        fill = [python, "-m", "halfwidth", "fill", log, "-o", track, "--report", report, "--force", "-q"]
+        fill = [python, "-m", "halfwidth", "fill", log, "-o", track, "--force", "-q"]
         rows = [
             ("python -c pass", [python, "-c", "pass"], None, None),
             ("import numpy", [python, "-c", "import numpy"], None, None),
             ("import halfwidth", [python, "-c", "import halfwidth"], 0.15, None),
-            ("import halfwidth, all names", [python, "-c", "import halfwidth as hw; [getattr(hw, n) for n in hw.__all__]"],
-             None, None),
+            ("import halfwidth, all names", [python, "-c", "from halfwidth import *"], None, None),
             ("halfwidth --help", [python, "-m", "halfwidth", "--help"], 0.4, None),
             ("halfwidth check, 10 min 10 Hz", [python, "-m", "halfwidth", "check", log], None, None),
-            ("halfwidth fill, 10 min 10 Hz", fill[:-5] + ["--force", "-q"], None, None),
-            ("the same with a report", fill, 3.0, 350.0),
+            ("halfwidth fill, 10 min 10 Hz", fill, None, None),
+            ("the same with a report", [*fill, "--report", report], 3.0, 350.0),
         ]  # fmt: skip
         print(f"{'':32}{'wall s':>8}{'CPU s':>8}{'MB':>8}   promised")
         for name, args, most_s, most_mb in rows:
@@ -74,8 +73,9 @@ def main() -> None:
 def readers(folder: str, runs: int) -> None:
     """Time the reader alone."""
     sys.path.insert(0, str(ROOT))
-    import halfwidth as hw
     from tests.vehicle.drives import drive, save
+
+    import halfwidth as hw
 
     for n in (6000, 100_000):
         path = save(Path(folder) / f"{n}.csv", drive(n, dt=0.02))

@@ -5,11 +5,11 @@ import tomllib
 
 import numpy as np
 import pytest
+from tests.vehicle.drives import drive, save
 
 import halfwidth as hw
 from halfwidth.job import Job, linear, run
 from halfwidth.shells import cli
-from tests.vehicle.drives import drive, save
 
 MODEL = """
 time = "when"

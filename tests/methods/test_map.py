@@ -43,7 +43,7 @@ def draw(seed, *, nx=3, ny=2, T=30, lost=0.2, E=True, F=True, boxes=False, caps=
 
 
 def literal(model, record, cost, caps=INF, floors=0.0):
-    """The program row by row as printed, solved by HiGHS: value, q, r. Rows with an unseen correlated output are dropped."""
+    """The program row by row as printed, solved by HiGHS: value, q, r; rows with an unseen partner are dropped."""
     import highspy
 
     T, nx, ny = len(record), model.nx, model.ny
@@ -180,7 +180,7 @@ def test_least_squares_stays_inside_the_optimal_half_widths():
 
 
 def test_known_and_unknown_half_widths_together():
-    model, record, truth = draw(6, F=False, T=60)
+    model, record, _ = draw(6, F=False, T=60)
     true_q = np.array([0.3, 0.3, 0.3])
     known = dataclasses.replace(model, w=hw.Uniform(true_q))
     est = hw.estimate(known, record, BatchLP()).check()

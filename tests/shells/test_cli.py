@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.vehicle.drives import drive, save
 
 import halfwidth as hw
 from halfwidth.shells import cli, commands
-from tests.vehicle.drives import drive, save
 
 GOOD, INTERNAL, USAGE, BAD, NO_ESTIMATE, LIMIT = 0, 1, 2, 3, 4, 6
 
@@ -270,7 +270,10 @@ def test_a_full_disk_leaves_the_old_file(name, log, tmp_path):
 def test_a_standard_output_that_is_full(args, log):
     with open("/dev/full", "wb") as full:
         found = subprocess.run(
-            [sys.executable, "-m", "halfwidth", args[0], log, *args[1:]], stdout=full, stderr=subprocess.PIPE, check=False
+            [sys.executable, "-m", "halfwidth", args[0], log, *args[1:]],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            check=False,
         )
     assert found.returncode == LIMIT
     assert b"no space left on device" in found.stderr
@@ -407,11 +410,11 @@ def test_progress_shows_on_a_terminal_only(monkeypatch):
     assert shown.getvalue() == ""
     monkeypatch.setenv("TERM", "xterm")
     with commands._working("filling", quiet=False) as progress:
-        progress(0.25, "em: 1 s")
+        progress(3, 12)
         deadline = time.monotonic() + 5
-        while "25 %" not in shown.getvalue() and time.monotonic() < deadline:
+        while "3/12" not in shown.getvalue() and time.monotonic() < deadline:
             time.sleep(0.05)
-    assert "\rfilling 25 %, em: 1 s, " in shown.getvalue()
+    assert "\rfilling 3/12, " in shown.getvalue()
     # what was shown is wiped away
     assert shown.getvalue().endswith("\r")
 

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from tests.vehicle.drives import drive, save
 
 import halfwidth as hw
 from halfwidth.vehicle.check import quantisation
-from tests.vehicle.drives import drive, save
 
 
 def checked(tmp_path, **changes):
@@ -45,7 +45,12 @@ def test_a_good_log_is_good(tmp_path):
             "--columns 'yaw_rate=-yaw_rate_radps[deg/s]'",
         ),
         ({"azimuth_rad": np.degrees}, "azimuth", "in degrees clockwise", "--columns 'azimuth=azimuth_rad[deg]'"),
-        ({"azimuth_rad": lambda v: -v}, "azimuth", "radians counter-clockwise", "--columns 'azimuth=-azimuth_rad[rad]'"),
+        (
+            {"azimuth_rad": lambda v: -v},
+            "azimuth",
+            "radians counter-clockwise",
+            "--columns 'azimuth=-azimuth_rad[rad]'",
+        ),
         ({"azimuth_rad": lambda v: np.pi / 2 - v}, "azimuth", "counter-clockwise from east", ""),
         ({"azimuth_rad": lambda v: v + 1.0}, "azimuth", "no known convention explains it", ""),
     ],
@@ -124,7 +129,9 @@ def test_plain_data_and_text(tmp_path):
     lines = found.summary().splitlines()
     assert lines[0] == f"{found.source}: bad"
     assert lines[3].startswith("bad         speed")
-    assert repr(found) == f"Check({found.source!r}: bad, 1 bad, 0 warn, {sum(i.verdict == 'ok' for i in found.items)} ok)"
+    assert (
+        repr(found) == f"Check({found.source!r}: bad, 1 bad, 0 warn, {sum(i.verdict == 'ok' for i in found.items)} ok)"
+    )
     with pytest.raises(KeyError):
         found["nothing"]
 
@@ -136,7 +143,11 @@ def test_a_log_and_a_table_are_taken_too(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "verdict"),
-    [("balzer_dresden_2014_03_26", "ok"), ("driveplotr_nds_drive18", "warn"), ("smartloc_berlin_potsdamer_platz", "ok")],
+    [
+        ("balzer_dresden_2014_03_26", "ok"),
+        ("driveplotr_nds_drive18", "warn"),
+        ("smartloc_berlin_potsdamer_platz", "ok"),
+    ],
 )
 def test_real_logs(name, verdict, data):
     found = hw.vehicle.check(data / f"{name}.csv.gz")

@@ -45,7 +45,8 @@ def test_car_points_where_it_goes(drive):
 
 def test_drive_is_that_of_a_car_in_a_city(drive):
     truth, _ = drive
-    assert truth.speed_mps.max() < 15
+    assert 12 < truth.speed_mps.max() < 15.5
+    assert truth.speed_mps[truth.speed_mps > 5].std() > 1
     assert truth.speed_mps.min() == 0
     assert 0.03 < np.mean(truth.speed_mps == 0) < 0.4  # it stops, but not for long
     assert np.abs(np.diff(truth.speed_mps)).max() < 0.3  # 3 m/s^2 at 10 Hz

@@ -4,10 +4,10 @@ import pickle
 
 import numpy as np
 import pytest
+from tests.vehicle.drives import drive
 
 import halfwidth as hw
 from halfwidth.vehicle.log import COLUMNS, STREAMS, Log
-from tests.vehicle.drives import drive
 
 
 def a_log(**more):

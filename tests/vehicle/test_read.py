@@ -5,12 +5,12 @@ import sys
 
 import numpy as np
 import pytest
+from tests.vehicle.drives import drive, save, text
 
 import halfwidth as hw
 from halfwidth.vehicle import evidence
 from halfwidth.vehicle.formats import layout
 from halfwidth.vehicle.log import STREAMS
-from tests.vehicle.drives import drive, save, text
 
 TRUE = drive()
 
@@ -62,8 +62,14 @@ LAYOUTS = {
     ),
     "German": (
         with_columns(
-            Zeit=("t_s", same), Breitengrad=("lat_deg", same), Längengrad=("lon_deg", same), Kurs=("azimuth_rad", np.degrees),
-            **{"Geschwindigkeit [km/h]": ("speed_mps", lambda v: v * 3.6), "Gierrate [°/s]": ("yaw_rate_radps", np.degrees)},
+            Zeit=("t_s", same),
+            Breitengrad=("lat_deg", same),
+            Längengrad=("lon_deg", same),
+            Kurs=("azimuth_rad", np.degrees),
+            **{
+                "Geschwindigkeit [km/h]": ("speed_mps", lambda v: v * 3.6),
+                "Gierrate [°/s]": ("yaw_rate_radps", np.degrees),
+            },
         ),
         {"delimiter": ";", "decimal": ","},
     ),
@@ -337,7 +343,9 @@ def test_names_and_units_are_recognised(name, role, unit):
     assert layout.role_of(name)[:2] == (role, unit)
 
 
-@pytest.mark.parametrize("name", ["speed_accuracy", "lat_std", "wheel_speed_fl", "yaw_rate_bias", "temperature", "", "#"])
+@pytest.mark.parametrize(
+    "name", ["speed_accuracy", "lat_std", "wheel_speed_fl", "yaw_rate_bias", "temperature", "", "#"]
+)
 def test_other_names_are_left_alone(name):
     assert layout.role_of(name) is None
 
@@ -404,7 +412,7 @@ def test_a_frozen_receiver_is_an_outage(tmp_path):
     for name in ("lat_deg", "lon_deg"):
         columns[name] = np.where(frozen, columns[name][699], columns[name])
     log = hw.vehicle.read(save(tmp_path / "log.csv", columns))
-    (start, stop), = log.gaps()
+    ((start, stop),) = log.gaps()
     assert 69.5 < start < 71
     assert stop == 90
 

@@ -117,7 +117,10 @@ def test_one_gap_is_singular_and_no_gap_says_so():
 @pytest.mark.parametrize(
     ("guarantee", "words"),
     [
-        ("credible", "90 % credible interval: east and north each lie inside with probability 90 %"),
+        (
+            "credible",
+            "90 % credible interval: where a fix would be, east and north each lie inside with probability 90 %",
+        ),
         ("proven", "proven bound: it holds as long as the noise stays within"),
         ("none", "an indication of size: no probability is claimed"),
     ],
@@ -282,13 +285,21 @@ def test_page_of_6000_points_is_small_and_quick():
 @pytest.mark.parametrize("many", ["rows", "gaps"])
 def test_page_of_a_huge_track_is_bounded(many):
     if many == "rows":
-        track = simulated(100_000)
+        track = simulated(40_000)
     else:
         track = made_track(60_000, outages=tuple((10 * k + 5, 10 * k + 8) for k in range(5900)))
     text = page(track)
     assert len(text.encode()) <= 1_500_000
     assert f"of {len(track):,} rows, gaps first" in text
     assert ("The 500 known worst of" in text) == (many == "gaps")
+
+
+def test_a_long_list_of_gaps_starts_with_the_worst():
+    track = made_track(1000, outages=tuple((10 * k + 3, 10 * k + 4 + k % 3) for k in range(60)))
+    text = page(track)
+    assert "The 20 known worst." in text
+    assert f"All {len(track.gaps)} gaps" in text
+    assert "The 20 known worst." not in page(made_track())
 
 
 def test_thinning_keeps_the_ends_of_gaps_and_the_worst_row():
@@ -301,6 +312,22 @@ def test_thinning_keeps_the_ends_of_gaps_and_the_worst_row():
         assert {first + 1, stop - 2} <= set(rows.tolist())
     inside = np.isin(rows, np.flatnonzero(track.quality != "fix"))
     assert inside.mean() > 0.3  # gaps are drawn finer than the rest
+
+
+def test_pauses_of_the_log_are_named_and_not_drawn_across():
+    t = np.arange(120) / 10 + np.where(np.arange(120) >= 70, 45.0, 0.0)
+    text = page(made_track(t_s=t, gaps=(), outages=(), quality=np.full(120, "fix")))
+    assert "the log has no rows for 45.1 s from 6.9 s: nothing is filled there" in Reader(text).text().replace(
+        "\u00a0", " "
+    )
+    assert re.search(r'class="way" d="([^"]*)"', text)[1].count("M") == 2
+    assert re.search(r'id="l-speed" d="([^"]*)"', text)[1].count("M") == 2
+    assert "has no rows" not in page(made_track())
+
+
+def test_worst_half_width_beyond_the_last_fix_is_said_so():
+    track = made_track(gaps=made_track().gaps[-1:])
+    assert verdict(track).replace("\u00a0", " ").endswith("1 s after the last fix.")
 
 
 # --- drawing --------------------------------------------------------------------------------------

@@ -65,8 +65,8 @@ _STATUS = {
     Verdict.REDUCED: Status.REDUCED,
     Verdict.INFEASIBLE: Status.INFEASIBLE,
 }
-#: Share of sigma, or of itself if larger, by which an optimal half-width is widened for the least-squares stage, and what
-#: is tried next where that leaves too little room.
+#: Share of sigma, or of itself if larger, by which an optimal half-width is widened for the least-squares stage; the
+#: second where the first leaves too little room.
 _RELAX = (1e-6, 1e-4)
 #: Residuals, half-widths and excesses below this share of sigma count as 0.
 _ZERO = 1e-5
@@ -87,7 +87,7 @@ class BatchLP:
         half-width, since it has no minimum otherwise.
     point : {"least_squares", "optimal"}
         Which trajectory of the optimal face: that of least squares in units of sigma, inside the optimal half-widths
-        widened by 1e-6 of sigma; or the one the solver happens to return.
+        widened by 1e-6 of sigma (1e-4 where that leaves too little room); or the one the solver happens to return.
     grow_caps : bool
         Where the caps ``at_most`` of unknown half-widths leave no trajectory, double them until one fits (step 7 of
         the paper's algorithm); ``info["caps_grown"]`` says how often.
@@ -126,10 +126,10 @@ class BatchLP:
     --------
     >>> import halfwidth as hw
     >>> unknown = hw.Uniform.unknown(at_most=10.0)
-    >>> walk = hw.Linear([[1]], None, [[1]], unknown, unknown, None)
-    >>> est = hw.estimate(walk, hw.Record([0, 1, 2, 3], [0.0, 0.4, None, 1.2]), hw.BatchLP())
+    >>> car = hw.Linear([[1, 1], [0, 1]], None, [[1, 0]], unknown, unknown, None, names=["p", "v"])
+    >>> est = hw.estimate(car, hw.Record([0, 1, 2, 3, 4], [1.0, 1.5, None, 2.5, 3.0]), hw.BatchLP())
     >>> est.x[:, 0].round(3)
-    array([0. , 0.4, 0.8, 1.2])
+    array([1. , 1.5, 2. , 2.5, 3. ])
     """
 
     objective: Literal["scaled", "paper", "log"] = "scaled"

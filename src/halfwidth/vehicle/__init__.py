@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 #: Public names and the module of each, loaded when first used.
 _HOME: dict[str, str] = {
     "Check": "check",
+    "Gap": "track",
     "Frame": "frames",
     "Limits": "formats",
     "Log": "log",
@@ -27,6 +28,7 @@ _HOME: dict[str, str] = {
     "mat_nb": "frames",
     "outages": "outage",
     "read": "formats",
+    "simulate_drive": "drive",
     "two_antenna": "models",
     "two_antenna_linear": "models",
 }
@@ -36,6 +38,7 @@ __all__ = sorted(_HOME)
 if TYPE_CHECKING:
     from halfwidth.vehicle.check import Check as Check
     from halfwidth.vehicle.check import check as check
+    from halfwidth.vehicle.drive import simulate_drive as simulate_drive
     from halfwidth.vehicle.estimators import METHODS as METHODS
     from halfwidth.vehicle.fill import fill as fill
     from halfwidth.vehicle.formats import Limits as Limits
@@ -51,6 +54,7 @@ if TYPE_CHECKING:
     from halfwidth.vehicle.models import two_antenna_linear as two_antenna_linear
     from halfwidth.vehicle.outage import Outages as Outages
     from halfwidth.vehicle.outage import outages as outages
+    from halfwidth.vehicle.track import Gap as Gap
     from halfwidth.vehicle.track import Track as Track
 
 

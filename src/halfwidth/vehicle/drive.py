@@ -30,7 +30,9 @@ Floats = NDArray[np.float64]
 #: Steps in time and along the road on which the drive is laid out, in seconds and metres.
 _DT, _DS = 0.01, 0.25
 
-_LIMIT = 50 / 3.6  # m/s
+#: Speeds that drivers want on a stretch of road, m/s.
+_LIMITS = (30 / 3.6, 40 / 3.6, 50 / 3.6)
+
 _SPEED_UP, _BRAKE, _SIDEWAYS = 1.6, 2.0, 2.5  # m/s^2
 
 
@@ -273,10 +275,11 @@ def _motion(
     rng: np.random.Generator, duration: float, start: tuple[float, float]
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Drive a random road: time, speed, unwrapped azimuth, latitude and longitude, 100 a second."""
-    curvature, halts = _road(rng, duration * _LIMIT + 200)
+    curvature, wanted, halts = _road(rng, duration * _LIMITS[-1] + 200)
     along = np.arange(curvature.size) * _DS
-    fastest = np.minimum(_LIMIT, np.sqrt(_SIDEWAYS / np.maximum(np.abs(curvature), 1e-6)))
-    fastest *= 1 + 0.05 * _smooth(rng.standard_normal(along.size), 400)[: along.size]
+    # nobody holds a speed: a few per cent up and down, every hundred metres or so
+    mood = 1 + 0.04 * np.sqrt(400) * _smooth(rng.standard_normal(along.size), 400)
+    fastest = np.minimum(wanted * np.clip(mood, 0.85, 1.1), np.sqrt(_SIDEWAYS / np.maximum(np.abs(curvature), 1e-6)))
     halt_rows = np.array(sorted(halts), dtype=int)
     fastest[halt_rows] = 0.0
     fastest[0] = 0.0
@@ -308,10 +311,10 @@ def _motion(
     return clock.astype(np.float64), speed, azimuth, np.degrees(lat), np.degrees(lon)
 
 
-def _road(rng: np.random.Generator, length: float) -> tuple[Floats, dict[int, float]]:
-    """Draw a road: its curvature every `_DS` metres (right is positive), and halts in seconds."""
+def _road(rng: np.random.Generator, length: float) -> tuple[Floats, Floats, dict[int, float]]:
+    """Draw a road: every `_DS` metres its curvature (right is positive) and wanted speed; halts in seconds."""
     rows = int(length / _DS) + 1
-    curvature = np.zeros(rows)
+    curvature, wanted = np.zeros(rows), np.full(rows, _LIMITS[-1])
     halts: dict[int, float] = {}
     row, heading = int(60 / _DS), 0.0
     while row < rows:
@@ -327,8 +330,9 @@ def _road(rng: np.random.Generator, length: float) -> tuple[Floats, dict[int, fl
         stop = min(row + max(int(radius * angle / _DS), 1), rows)
         curvature[row:stop] = side / radius
         heading += float(side * angle)
+        wanted[row:] = rng.choice(_LIMITS, p=(0.15, 0.25, 0.6))
         row = stop
-    return _smooth(curvature, 33), halts
+    return _smooth(curvature, 33), wanted, halts
 
 
 def _profile(fastest: Floats) -> Floats:

@@ -133,6 +133,16 @@ def round_step(size: float) -> float:
     return float(power * min(k for k in (1, 2, 5, 10) if k * power >= size * (1 - 1e-9)))
 
 
+def pause_of(t: Floats) -> float:
+    """Choose the step in time, in seconds, beyond which rows are not joined by a line."""
+    return max(5 * float(np.median(np.diff(t))), 2.0) if t.size > 1 else 2.0
+
+
+def pauses_of(t: Floats) -> Rows:
+    """Find the rows after which the log pauses."""
+    return np.flatnonzero(np.diff(t) > pause_of(t)).astype(np.int64)
+
+
 def limits_of(half_m: Floats, most: int = 5) -> list[float]:
     """Choose the limits between the colours of half-widths: from the series 1, 2, 5, in metres."""
     if half_m.size == 0:
@@ -260,7 +270,10 @@ def map_svg(track: Track, plane: Plane, view: View, rows: Rows, limits: Sequence
         ]
         gaps.append(f"<g{dashed}>{''.join(parts)}</g>")
     out.append(f'<g id="bands" class="band">{"".join(bands)}</g>')
-    out.append(f'<path class="way" d="{line(x, y)}"/>')
+    # no line where the log has no rows: nobody knows how the vehicle went
+    before = np.searchsorted(rows, pauses_of(track.t_s), side="right")
+    pieces = np.split(np.arange(rows.size), before)
+    out.append(f'<path class="way" d="{"".join(line(x[piece], y[piece]) for piece in pieces)}"/>')
     fx, fy = plane.units(log.lat_deg[seen], log.lon_deg[seen])
     out.append(f'<path id="fixes" class="fix" d="{dots(fx, fy)}"/>')
     out.append(f'<g id="filled" class="gap">{"".join(gaps)}</g>')
@@ -289,8 +302,8 @@ def scale_bar(view: View, plane: Plane) -> tuple[float, float]:
     return length, 100 * length / wide
 
 
-def chart_path(t: Floats, y: Floats, t0: float, t1: float, y0: float, y1: float) -> str:
-    """Draw values against time; unknown values and jumps by more than half the range break it.
+def chart_path(t: Floats, y: Floats, t0: float, t1: float, y0: float, y1: float, pause: float | None = None) -> str:
+    """Draw values against time; unknown values and pauses break the line.
 
     At most four points are kept in each of 500 slices of time, the first, the last, the smallest
     and the largest, which draws the same picture.
@@ -309,9 +322,10 @@ def chart_path(t: Floats, y: Floats, t0: float, t1: float, y0: float, y1: float)
         kept = known
     px = (t[kept] - t0) / max(t1 - t0, 1e-9) * CHART_WIDTH
     py = CHART_HEIGHT - (np.clip(y[kept], y0, y1) - y0) / (y1 - y0) * CHART_HEIGHT
-    # an unknown value in between breaks the line
-    unknown = np.cumsum(~np.isfinite(y))
-    broken = np.diff(unknown[kept]) > 0
+    # an unknown value in between breaks the line, and so does a pause
+    breaks = np.cumsum(~np.isfinite(y))
+    breaks[1:] += np.cumsum(np.diff(t) > (pause_of(t) if pause is None else pause))
+    broken = np.diff(breaks[kept]) > 0
     pieces = np.split(np.arange(kept.size), np.flatnonzero(broken) + 1)
     return "".join(line(px[piece], py[piece]) for piece in pieces)
 
@@ -320,4 +334,5 @@ def turning_path(t: Floats, azimuth_deg: Floats, t0: float, t1: float) -> str:
     """Draw an azimuth from 0 to 360 degrees, broken where it passes north."""
     jump = np.flatnonzero(np.abs(np.diff(azimuth_deg)) > 180)
     parts = np.split(np.arange(t.size), jump + 1)
-    return "".join(chart_path(t[part], azimuth_deg[part], t0, t1, 0.0, 360.0) for part in parts)
+    pause = pause_of(t)
+    return "".join(chart_path(t[part], azimuth_deg[part], t0, t1, 0.0, 360.0, pause) for part in parts)

@@ -30,6 +30,9 @@ _MOST = {
     "alt_m": 20_000.0,
 }
 
+#: No quantity in whatever unit is this large; sums of larger ones would overflow.
+_ABSURD = 1e12
+
 #: A unit mistake makes values this much larger, at most; left alone where it is to be reported.
 _MISTAKE = 180 / np.pi
 
@@ -159,7 +162,7 @@ def _time(raw: Raw, notes: list[str]) -> tuple[Floats, float | None]:
             return seconds(stamps)[0], None
         t, base = seconds(stamps)
         return t, base
-    values = np.where(np.isinf(raw.values["time"]), np.nan, raw.values["time"])
+    values = np.where(np.abs(raw.values["time"]) > 1e20, np.nan, raw.values["time"])
     if not np.isfinite(values).any():
         raise BadLog(
             f"column `{use.column}` of `{raw.source}` holds no time in any row",
@@ -228,14 +231,15 @@ def _is_scaled(values: Floats) -> bool:
 
 
 def _drop_infinite(streams: dict[str, Floats], notes: list[str]) -> None:
-    n = 0
-    for name, values in streams.items():
-        infinite = np.isinf(values)
-        if infinite.any():
-            n += int(infinite.sum())
-            streams[name] = np.where(infinite, np.nan, values)
-    if n:
-        notes.append(f"{_n(n, 'infinite value')} dropped")
+    for words, most in (("infinite value", np.finfo(float).max), (f"value beyond {_ABSURD:g}", _ABSURD)):
+        n = 0
+        for name, values in streams.items():
+            beyond = np.abs(values) > most
+            if beyond.any():
+                n += int(beyond.sum())
+                streams[name] = np.where(beyond, np.nan, values)
+        if n:
+            notes.append(f"{n} {words.replace('value', 'value' + 's' * (n != 1))} dropped")
 
 
 def _drop_invalid(raw: Raw, streams: dict[str, Floats], notes: list[str]) -> None:

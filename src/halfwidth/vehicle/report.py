@@ -32,6 +32,9 @@ from halfwidth.vehicle.track import Gap, Track, runs, steps_m
 #: Rows of a table behind a chart, gaps in the table of gaps and pins on the map, at most.
 _BEHIND, _MOST_GAPS, _MOST_PINS = 60, 500, 20
 
+#: Gaps that are listed before a line that opens all of them.
+_FEW_GAPS = 20
+
 #: How the verdicts of a check look, the worst first: a sign as well as a colour.
 _VERDICTS = {
     "bad": ("bad", "✗ bad"),
@@ -90,10 +93,13 @@ def verdict(track: Track) -> str:
     way = sum(gap.distance_m for gap in track.gaps)
     worst = max(track.gaps, key=lambda gap: gap.max_half_m)
     filled = f"{_count(count, 'gap')} filled: {_span(time)} and {_way(way)} without a fix."
-    return (
-        f"{filled} At worst the position is known to within {_size(worst.max_half_m)} east and"
-        f" north, in the {_span(worst.duration_s)} gap that starts at {_time(track, worst.start)}."
-    )
+    if worst.quality == "bridged":
+        where = f"in the {_span(worst.duration_s)} gap that starts at {_time(track, worst.start)}"
+    elif worst.start > track.t_s[0]:
+        where = f"{_span(worst.duration_s)} after the last fix"
+    else:
+        where = f"{_span(worst.duration_s)} before the first fix"
+    return f"{filled} At worst the position is known to within {_size(worst.max_half_m)} east and north, {where}."
 
 
 def kind_of_bound(track: Track) -> str:
@@ -106,8 +112,8 @@ def kind_of_bound(track: Track) -> str:
         ),
         "credible": (
             f"{share} credible interval",
-            f"east and north each lie inside with probability {share} under the model that was"
-            " fitted to this log. That is not a guarantee.",
+            f"where a fix would be, east and north each lie inside with probability {share} under the model that was"
+            " fitted to this log. That is not a guarantee, and an error that all fixes share is not in it.",
         ),
         "none": ("indication of size", "no probability is claimed for it."),
     }[track.guarantee]
@@ -249,6 +255,8 @@ def _size(metres: float) -> str:
 
 def _span(seconds: float) -> str:
     """Write a length of time."""
+    if 0 < seconds < 1:
+        return f"{seconds:.2g}\u00a0s"
     if seconds < 100:
         return f"{seconds:.1f}\u00a0s".replace(".0\u00a0", "\u00a0")
     minutes, rest = divmod(round(seconds), 60)
@@ -314,9 +322,20 @@ def _table(
 
 def _messages(track: Track) -> str:
     """List what a reader must know."""
-    if not track.messages:
+    pauses = picture.pauses_of(track.t_s)
+    known = [
+        *track.messages,
+        *(
+            f"the log has no rows for {_span(float(track.t_s[k + 1] - track.t_s[k]))} from"
+            f" {_time(track, float(track.t_s[k]))}: nothing is filled there"
+            for k in pauses[:5].tolist()
+        ),
+    ]
+    if pauses.size > 5:
+        known.append(f"and {_count(int(pauses.size) - 5, 'pause')} more of this kind")
+    if not known:
         return ""
-    items = "".join(f"<li>{_t(message)}</li>" for message in track.messages)
+    items = "".join(f"<li>{_t(message)}</li>" for message in known)
     return f'<ul class="flags">{items}</ul>\n'
 
 
@@ -410,7 +429,7 @@ def _map_section(track: Track, plane: Plane, view: View, rows: Rows, limits: Seq
         f'{_length(step)}</span>.{thinned} <span class="live hide">Drag to move; click, then turn the'
         " wheel to zoom; keys: arrows, + − 0, n and p for the next and previous gap, comma and full"
         " stop to step in time.</span></p>\n"
-        f'<div class="stage"><div class="tools live hide">{buttons}</div>\n'
+        f'<div class="tools live hide">{buttons}</div>\n'
         '<div class="map" id="frame" tabindex="0" role="application" aria-roledescription="map"'
         f' aria-label="{_t(_map_words(track))}">\n'
         f'<svg id="map" viewBox="{view.box()}" aria-hidden="true">{drawn}'
@@ -418,7 +437,7 @@ def _map_section(track: Track, plane: Plane, view: View, rows: Rows, limits: Seq
         f'{pins}<div class="tip live hide" id="tip" aria-hidden="true"></div>\n'
         '<div class="north" aria-hidden="true"><svg viewBox="0 0 20 26"><path d="M10 0l8 26-8-6-8 6z"/>'
         "</svg>N</div>\n"
-        f'<div class="bar" id="bar"><span id="barlength">{_length(length)}</span></div>\n</div></div>\n'
+        f'<div class="bar" id="bar"><span id="barlength">{_length(length)}</span></div>\n</div>\n'
         f'<ul class="legend">{"".join(f"<li>{item}</li>" for item in items)}</ul>\n'
         '<div class="cursor live hide"><label for="when">moment</label>'
         f'<input type="range" id="when" min="0" max="{rows.size - 1}" step="1" value="0">'
@@ -665,33 +684,43 @@ def _gap_section(track: Track, limits: Sequence[float]) -> str:
     """List the gaps, the worst in bold."""
     if not track.gaps:
         return '<section>\n<h2>Gaps</h2>\n<p class="about">None: every row has a fix.</p></section>\n'
-    shown = list(track.gaps)
-    left_out = ""
-    if len(shown) > _MOST_GAPS:
-        shown = sorted(sorted(shown, key=lambda g: -g.max_half_m)[:_MOST_GAPS], key=lambda g: g.start)
-        left_out = f'<p class="about">The {_MOST_GAPS} known worst of {len(track.gaps):,} are listed.</p>'
     numbers = {id(gap): k for k, gap in enumerate(track.gaps)}
+    by_size = sorted(track.gaps, key=lambda gap: -gap.max_half_m)
+    few = by_size if len(by_size) <= _FEW_GAPS + 5 else by_size[:_FEW_GAPS]
+    caption = (
+        "From the last fix before to the first fix after. Half-width: the largest in the gap, east or north, at level"
+        f" {track.level:g}."
+    )
+    text = _gap_table(track, few, numbers, limits, caption)
+    if len(few) < len(track.gaps):
+        listed = by_size[:_MOST_GAPS]
+        which = "All" if len(listed) == len(track.gaps) else f"The {_MOST_GAPS} known worst of"
+        text = (
+            f'<p class="about">The {len(few)} known worst.</p>{text}<details><summary>{which} {len(track.gaps):,} gaps'
+            f"</summary>{_gap_table(track, listed, numbers, limits, '')}</details>"
+        )
+    return f"<section>\n<h2>Gaps</h2>\n{text}</section>\n"
+
+
+def _gap_table(
+    track: Track, gaps: Sequence[Gap], numbers: Mapping[int, int], limits: Sequence[float], caption: str
+) -> str:
+    """Write gaps as a table in the order of time, the worst in bold."""
+    worst = max(gap.max_half_m for gap in gaps)
+    ordered = sorted(gaps, key=lambda gap: numbers[id(gap)])
     body = []
-    for gap in shown:
-        cells = _gap_cells(track, gap, numbers[id(gap)])
+    for gap in ordered:
+        number = numbers[id(gap)]
+        cells = _gap_cells(track, gap, number)
         index = int(np.searchsorted(np.asarray(limits), gap.max_half_m, side="right"))
-        colour = picture.colour_of(index, len(limits) + 1)
-        cells[5] = f'<span class="swatch h{colour}"></span>{cells[5]}'
+        cells[5] = f'<span class="swatch h{picture.colour_of(index, len(limits) + 1)}"></span>{cells[5]}'
         cells.append(
-            f'<button type="button" class="live hide" data-gap="{numbers[id(gap)]}"'
-            f' aria-label="show gap {numbers[id(gap)] + 1} on the map">show</button>'
+            f'<button type="button" class="live hide" data-gap="{number}"'
+            f' aria-label="show gap {number + 1} on the map">show</button>'
         )
         body.append(cells)
-    worst = int(np.argmax([gap.max_half_m for gap in shown]))
-    table = _table(
-        [*_GAP_HEAD, ""],
-        body,
-        caption=f"From the last fix before to the first fix after. Half-width: the largest in the gap,"
-        f" east or north, at level {track.level:g}.",
-        words=[6],
-        marked=[worst],
-    )
-    return f'<section>\n<h2>Gaps</h2>\n<p class="about">{left_out.strip()}</p>{table}</section>\n'
+    marked = [k for k, gap in enumerate(ordered) if gap.max_half_m == worst]
+    return _table([*_GAP_HEAD, ""], body, caption=caption, words=[6], marked=marked)
 
 
 def _fault_section(track: Track) -> str:
@@ -739,12 +768,38 @@ def _benchmark_section(track: Track) -> str:
     rows = _records(track.benchmark)
     if not rows:
         return ""
-    known = all({"method", "length_s", "mean_m", "max_m", "coverage"} <= row.keys() for row in rows)
-    table = _outage_table(track, rows) if known else _record_table(rows)
+    if all({"method", "length_s", "mean_m", "max_m", "coverage"} <= row.keys() for row in rows):
+        table = _outage_table(track, rows)
+    elif all({"length_s", "stretches", "mean_m", "max_m", "coverage", "inflation"} <= row.keys() for row in rows):
+        table = _own_table(track, rows)
+    else:
+        table = _record_table(rows)
     return (
         '<section>\n<h2>Outages made in this very log</h2>\n<p class="about">Fixes of this log were hidden and filled'
         " again. Errors are distances to the hidden fixes, so they include the fixes’ own errors.</p>"
         f"{table}</section>\n"
+    )
+
+
+def _own_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Write what the method itself found when it hid fixes to test its intervals."""
+    body = [
+        [
+            f"{row['length_s']:.3g}",
+            f"{row['stretches']}",
+            f"{row['mean_m']:.2f}",
+            f"{row['max_m']:.2f}",
+            f"{100 * row['coverage']:.0f} %",
+            f"{row['inflation']:.2f} times" if row["inflation"] > 1.005 else "not needed",
+        ]
+        for row in rows
+    ]
+    inside = f"inside the {100 * track.level:g} % interval"
+    return _table(
+        ["hidden for, s", "stretches", "mean error, m", "largest error, m", inside, "then widened"],
+        body,
+        caption="Mean error, and the mean over the stretches of the largest error in each. Half-widths in gaps are"
+        " widened until the promised share of hidden fixes lies inside.",
     )
 
 
@@ -779,17 +834,19 @@ def _tested(track: Track) -> str:
     rows = [
         row
         for row in _records(track.benchmark)
-        if row.get("method") == track.method and row.get("coverage") is not None and row.get("length_s")
+        if row.get("method", track.method) == track.method and row.get("coverage") is not None and row.get("length_s")
     ]
     if not rows:
         return ""
-    weights = [float(row["length_s"]) * float(row.get("starts", 1)) for row in rows]
+    weights = [float(row["length_s"]) * float(row.get("starts", row.get("stretches", 1))) for row in rows]
     share = sum(w * float(row["coverage"]) for w, row in zip(weights, rows, strict=True)) / sum(weights)
-    low, high = (pick(float(row["length_s"]) for row in rows) for pick in (min, max))
-    lengths = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    low, high = (f"{pick(float(row['length_s']) for row in rows):.3g}" for pick in (min, max))
+    lengths = low if low == high else f"{low} to {high}"
+    wider = max(float(row.get("inflation", 1.0)) for row in rows)
     return (
         f" Tested on this very log: with its own fixes hidden for {lengths}\u00a0s and filled again,"
-        f" {100 * share:.0f}\u00a0% of them lay inside."
+        f" {100 * share:.0f}\u00a0% of them lay inside"
+        + (f" before half-widths were widened, up to {wider:.1f}\u00a0times." if wider > 1.05 else ".")
     )
 
 
@@ -894,6 +951,7 @@ def _data(
         "northm": plane.north_m,
         "view": [round(view.x), round(view.y), round(view.width), round(view.height)],
         "zero": _zero(track),
+        "pause": picture.pause_of(track.t_s[rows]),
         "epoch": unix,
         "t": _differences(track.t_s[rows] * 1000),
         "x": _differences(x),

@@ -255,7 +255,7 @@
     const scale = W / (span[1] - span[0]);
     for (let k = a; k <= b; k++) {
       if (values[k] !== values[k]) { pen = "M"; continue; }
-      if (wraps && Math.abs(values[k] - before) > 180) pen = "M";
+      if ((wraps && Math.abs(values[k] - before) > 180) || (k > a && t[k] - t[k - 1] > data.pause)) pen = "M";
       before = values[k];
       out.push(`${pen}${((t[k] - span[0]) * scale).toFixed(1)},${(H - ((Math.min(Math.max(before, low), high) - low) / (high - low)) * H).toFixed(1)}`);
       pen = "L";
