@@ -7,8 +7,10 @@ import io
 import json
 import re
 import sys
+import threading
 import time
 from html.parser import HTMLParser
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
 
 import numpy as np
@@ -537,6 +539,34 @@ def test_policy_stops_what_gets_in_anyway(browser, drive):
     browser.settle()
     assert browser.run("typeof window.pwned") == "undefined"
     assert {"img-src", "connect-src"} <= set(browser.run("blocked"))
+
+
+@needs_browser
+def test_page_asks_nothing_of_a_server_either(browser, drive):
+    """Served over HTTP, where browsers look for an icon beside the page."""
+    asked = []
+
+    class Server(SimpleHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.directory = str(drive[1].parent)
+            super().do_GET()
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Server) as server:
+        serving = threading.Thread(target=server.serve_forever)
+        serving.start()
+        browser.events.clear()
+        browser("Page.navigate", url=f"http://127.0.0.1:{server.server_port}/{drive[1].name}")
+        browser.settle(0.5)
+        complaints = browser.complaints()
+        server.shutdown()
+        serving.join()
+    assert asked == [f"/{drive[1].name}"]
+    assert complaints == []
+    assert browser.run("document.documentElement.dataset.ready") == "yes"
 
 
 @needs_browser
