@@ -313,3 +313,22 @@ def test_half_widths_hold_hidden_fixes_of_real_logs(data, name):
             np.mean(np.abs(true[1] - found[1]) <= track.north_half_m[at]),
         ]
     assert np.mean(inside) > 0.75
+
+
+def test_a_receivers_own_log_is_filled_where_it_pauses():
+    """Nothing at all arrives in the tunnel: rows are added at the rate of the fixes."""
+    t = np.arange(0.0, 120.0)
+    lat, lon = 50 + 1e-4 * t, 14 + 2e-4 * np.sin(t / 30)
+    keep = (t < 50) | (t > 75)
+    track = hw.vehicle.fill(hw.vehicle.Log(t=t[keep], lat_deg=lat[keep], lon_deg=lon[keep]))
+    np.testing.assert_allclose(track.t_s, t)
+    assert np.all((track.quality == "bridged") == ~keep)
+    assert np.abs(track.lat_deg - lat).max() * 111e3 < 1.0
+    assert any("26 rows were added" in message for message in track.messages)
+
+
+def test_a_pause_longer_than_a_minute_is_left_open():
+    t = np.r_[np.arange(0.0, 60.0), np.arange(130.0, 190.0)]
+    track = hw.vehicle.fill(hw.vehicle.Log(t=t, lat_deg=50 + 1e-5 * t, lon_deg=np.full(t.size, 14.0)))
+    np.testing.assert_array_equal(track.t_s, t)
+    assert any("left open" in message for message in track.messages)

@@ -38,6 +38,9 @@ PIECE, CONTEXT, PAUSE = 600.0, 60.0, 60.0
 #: A pause between fixes of this length is a gap even where it is usual in the log, s.
 LONG = 5.0
 
+#: A pause of the whole log of more than this many usual fix intervals, and of `PAUSE` at most, gets rows of its own.
+ROWLESS = 2.5
+
 #: Fixes that a method with a model of motion needs.
 FEWEST = 5
 
@@ -71,7 +74,8 @@ def fill(
     -------
     Track
         Every fix, every row between fixes that are further apart than 1.5 times the usual, and every row before the
-        first and after the last fix.
+        first and after the last fix. Where the whole log pauses between two fixes, as a receiver's own log does in a
+        tunnel, rows are added at the usual rate of the fixes; a pause of more than a minute is left open.
 
     Raises
     ------
@@ -86,9 +90,10 @@ def fill(
     drive_log, native = as_log(log)
     if not drive_log.fixed.any():
         raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
+    messages: list[str] = []
+    drive_log = _with_pauses_filled(drive_log, messages)
     offset = 0.0 if clock_offset is None else float(clock_offset)
     grid = sampled(drive_log, clock_offset=offset)
-    messages: list[str] = []
     chosen = _chosen(grid, asked, messages)
     if clock_offset is None and chosen.name not in ("linear", "cv"):
         messages.append("the clocks of fixes and sensors were taken to agree")
@@ -165,6 +170,33 @@ def _chosen(grid: Grid, asked: Method | None, messages: list[str]) -> Method:
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
+
+
+def _with_pauses_filled(log: Log, messages: list[str]) -> Log:
+    """Add rows where nothing at all arrived between two fixes although at least two fixes were due."""
+    fixes = log.t[log.fixed]
+    if fixes.size < 3:
+        return log
+    usual = float(np.median(np.diff(fixes)))
+    step = np.diff(log.t)
+    pauses = np.flatnonzero((step > ROWLESS * usual) & (log.t[:-1] >= fixes[0]) & (log.t[1:] <= fixes[-1]))
+    open_ = [k for k in pauses if step[k] > PAUSE]
+    messages.extend(
+        f"nothing arrived for {step[k]:.0f} s from {log.t[k]:.1f} s on: longer than {PAUSE:.0f} s, left open"
+        for k in open_
+    )
+    added = [
+        np.linspace(log.t[k], log.t[k + 1], round(step[k] / usual) + 1)[1:-1] for k in pauses if step[k] <= PAUSE
+    ]
+    if not added:
+        return log
+    times = np.concatenate(added)
+    total = sum(step[k] for k in pauses if step[k] <= PAUSE)
+    messages.append(
+        f"nothing arrived in {len(added)} pause{'s' if len(added) > 1 else ''} of the log, {total:.1f} s in all:"
+        f" {times.size} rows were added there"
+    )
+    return log.with_rows(times)
 
 
 def _wanted(log: Log) -> tuple[NDArray[np.intp], NDArray[np.str_]]:
