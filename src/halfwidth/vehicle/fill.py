@@ -44,6 +44,9 @@ ROWLESS = 2.5
 #: Fixes that a method with a model of motion needs.
 FEWEST = 5
 
+#: Times that fixes are screened for strays at most.
+_SCREENINGS = 3
+
 #: Rounds in which the chain is solved again with hidden fixes, its scales kept.
 _AGAIN = 3
 
@@ -185,9 +188,7 @@ def _with_pauses_filled(log: Log, messages: list[str]) -> Log:
         f"nothing arrived for {step[k]:.0f} s from {log.t[k]:.1f} s on: longer than {PAUSE:.0f} s, left open"
         for k in open_
     )
-    added = [
-        np.linspace(log.t[k], log.t[k + 1], round(step[k] / usual) + 1)[1:-1] for k in pauses if step[k] <= PAUSE
-    ]
+    added = [np.linspace(log.t[k], log.t[k + 1], round(step[k] / usual) + 1)[1:-1] for k in pauses if step[k] <= PAUSE]
     if not added:
         return log
     times = np.concatenate(added)
@@ -303,7 +304,7 @@ def _estimated(
     pieces: Sequence[_Piece], chosen: Method, lengths: Floats, level: float, messages: list[str]
 ) -> _Answers:
     """Estimate every piece, with simpler methods where the chosen one fails, and test the intervals."""
-    grids = [piece.grid for piece in pieces]
+    grids = [piece.grid for piece in pieces]  # of which the chain takes away the fixes it cannot believe
     able = [i for i, grid in enumerate(grids) if chosen.name == "linear" or int(grid.seen.sum()) >= FEWEST]
     found, rerun, settings = _chain(grids, able, messages) if chosen.name == "em" else _plain(chosen, grids, able)
     failed = [i for i in range(len(grids)) if i not in found or not _plausible(found[i], grids[i])]
@@ -329,10 +330,24 @@ def _estimated(
 
 
 def _chain(
-    grids: Sequence[Grid], able: Sequence[int], messages: list[str]
+    grids: list[Grid], able: Sequence[int], messages: list[str]
 ) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
     """Solve the chain for the pieces that have enough fixes."""
     fits = dict(zip(able, chain.solve([grids[i] for i in able]), strict=True))
+    stray: list[float] = []
+    todo = list(able)
+    for _ in range(_SCREENINGS):
+        hidden = {i: _stray(fits[i].path, grids[i]) for i in todo}
+        todo = [i for i in todo if hidden[i].any()]
+        for i in todo:
+            stray += grids[i].t[hidden[i]].tolist()
+            grids[i] = grids[i].masked(hidden[i])
+        fits |= zip(todo, chain.solve([grids[i] for i in todo]), strict=True)
+    if stray:
+        times = sorted(set(stray))
+        words = ", ".join(f"{t:.1f}" for t in times[:5]) + (" ..." if len(times) > 5 else "")
+        some = "1 fix is" if len(times) == 1 else f"{len(times)} fixes are"
+        messages.append(f"{some} far from where the vehicle can have been and left out: t = {words} s")
 
     def rerun(which: Sequence[int], hidden: Sequence[Grid]) -> list[Path]:
         return [
@@ -362,6 +377,17 @@ def _chain(
             " the half-widths have it added"
         )
     return {i: fit.path for i, fit in fits.items()}, rerun, settings
+
+
+def _stray(path: Path, grid: Grid) -> NDArray[np.bool_]:
+    """Return the nodes whose fix is far off the path, (T,): one multipath fix must not set the noise of the drive.
+
+    Far is beyond 8 times the median distance, 5 standard deviations of a fix and 3 m. Where more than a tenth of the
+    fixes would go it is the path that is wrong, and none goes.
+    """
+    off = np.hypot(path.east - grid.east, path.north - grid.north)
+    far = grid.seen & ~(off <= max(8 * float(np.median(off[grid.seen])), 5 * path.fix_variance**0.5, 3.0))
+    return far if path.finite and far.sum() <= 0.1 * grid.seen.sum() else np.zeros(len(grid), dtype=bool)
 
 
 def _plain(
