@@ -222,3 +222,16 @@ def test_bad_arguments(change, error, words):
     model = models[change.pop("model")]() if "model" in change else truth()
     with pytest.raises(error, match=words):
         hw.learn(model, change.pop("record", RECORD), **change)
+
+
+@pytest.mark.parametrize("structure", ["full", "diagonal"])
+def test_an_entry_without_noise_stays_without(structure):
+    model = hw.Linear(
+        [[1, 1], [0, 1]], None, [[1, 0]], hw.Gaussian([0.0, 0.2]), hw.Gaussian(2.0), hw.Normal([0, 0], 1.0)
+    )
+    record = gappy(model, 1000, 5)
+    start = dataclasses.replace(model, w=hw.Gaussian([0.0, 1.0]), e=hw.Gaussian(1.0))
+    for method in ("em", "ml"):
+        q, r = found(hw.learn(start, record, structure={"Q": structure}, method=method))
+        assert abs(q[0, 0]) < 0.01 * q[1, 1]
+        np.testing.assert_allclose([q[1, 1], r[0, 0]], [0.2, 2.0], rtol=0.25)

@@ -7,7 +7,7 @@ exact with any entry missing (core/kalman.hpp). Expectation maximisation (Shumwa
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -118,7 +118,7 @@ def learn(
     >>> hw.learn(guess, record).check().model.e.cov().single.round(0)
     array([[4.]])
     """
-    records = [record] if isinstance(record, Record) else list(record)
+    records = list(record) if isinstance(record, Iterable) else [record]
     if not records or not all(isinstance(r, Record) for r in records):
         raise BadRecord("`record` holds no Record, one or several were expected")
     what = (what,) if isinstance(what, str) else tuple(what)
@@ -391,6 +391,10 @@ class _Problem:
             return _scaled(now, _scale_of(self.stack(now), sums, rows))
         S = sums.sum(axis=0) / n
         S = 0.5 * (S + S.T)
+        # an entry without noise stays without, whatever rounding says
+        silent = (np.diagonal(now.single) == 0.0) | (np.diagonal(S) <= 0.0)
+        S[silent] = S[:, silent] = 0.0
+        S = _semidefinite(S)
         return np.diag(np.diagonal(S)) if kind == "diagonal" else S
 
     def stack(self, matrix: Varying) -> Array:
@@ -479,6 +483,16 @@ def _regression(Wz: Array, Z: Array, Q: Array, mask: Any, lo: Array, hi: Array) 
         open_ &= ~out
     step[i, j] = d
     return step
+
+
+def _semidefinite(S: Array) -> Array:
+    """Return a symmetric matrix without the negative eigenvalues that rounding left, judged at unit diagonal."""
+    d = np.sqrt(np.diagonal(S))
+    d = np.where(d > 0, d, 1.0)
+    value, vector = np.linalg.eigh(S / np.outer(d, d))
+    if value[0] >= 0:
+        return S
+    return (vector * np.maximum(value, 0.0)) @ vector.T * np.outer(d, d)
 
 
 def _covariance(model: Linear, name: str) -> Varying:
