@@ -308,3 +308,16 @@ def test_any_recursive_method_runs_and_resumes(monkeypatch):
             live.push(bad)
     with pytest.raises(hw.BadRecord, match="`dt`"):
         live.push(None, dt=-1.0)
+
+
+def test_the_newest_estimate_can_be_copied_and_sent():
+    import copy
+    import pickle
+
+    walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(1.0), hw.Gaussian(1.0), hw.Normal([0.0], 1.0))
+    newest = hw.stream(walk, hw.KalmanFilter()).push(1.0)
+    for twin in (copy.deepcopy(newest), pickle.loads(pickle.dumps(newest))):
+        np.testing.assert_array_equal(twin.x, newest.x)
+        np.testing.assert_array_equal(twin.P, newest.P)
+        assert (twin.status, twin.loglik, twin.method, twin.names) == (
+            newest.status, newest.loglik, newest.method, newest.names)  # fmt: skip

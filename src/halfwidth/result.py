@@ -2,7 +2,7 @@
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
@@ -217,6 +217,10 @@ class Newest(Estimate):
         """Probability that y was received, where the stream's method knows it."""
         found = getattr(self._belief, "gamma", None)
         return None if found is None else np.atleast_1d(np.asarray(found))
+
+    def __reduce__(self) -> Any:
+        """Copy and pickle as a plain estimate, which holds no object of the kernel."""
+        return Estimate, tuple(getattr(self, one.name) for one in fields(Estimate))
 
     @property
     def info(self) -> Mapping[str, Any]:
