@@ -393,3 +393,13 @@ def test_any_log_gets_a_track():
         log = Log(**columns).without(first, first + 0.5 * np.ptp(columns["t"]) * rng.random())
         if log.fixed.any():
             sound(fill(log))
+
+
+def test_half_widths_that_could_not_be_tested_claim_no_probability():
+    made = drive()
+    columns = {name: getattr(made.log, name).copy() for name in ("lat_deg", "lon_deg", "speed_mps", "yaw_rate_radps")}
+    kept = np.flatnonzero(made.log.fixed)[::300]
+    for name in ("lat_deg", "lon_deg"):
+        columns[name][~np.isin(np.arange(len(made.log)), kept)] = NAN
+    assert sound(fill(Log(t=made.t, **columns))).guarantee == "none"
+    assert fill(made.log.without(60, 80)).guarantee == "credible"

@@ -103,7 +103,8 @@ def fill(
     wanted, quality = _wanted(drive_log)
     t = drive_log.t[wanted]
     pieces = _pieces(grid, drive_log)
-    answers = _estimated(pieces, chosen, _spans(drive_log, t, quality), level, messages)
+    lengths = _spans(drive_log, t, quality)
+    answers = _estimated(pieces, chosen, lengths, level, messages)
     columns = _read(answers, pieces, t)
     away, length = _distance_in_time(drive_log, t)
     z = NormalDist().inv_cdf(0.5 + level / 2)
@@ -127,7 +128,8 @@ def fill(
         method=chosen.name,
         log=drive_log,
         gaps=gaps,
-        guarantee="credible",
+        # where nothing could be tested, a model's own variance is a size and no probability
+        guarantee="credible" if answers.tested or not lengths.size else "none",
         benchmark=tuple(asdict(one) for one in answers.tested) or None,
         settings=settings,
         messages=tuple(messages),
