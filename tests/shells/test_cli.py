@@ -113,6 +113,8 @@ def test_completion():
         (["fill", "x", "-o", "no/such/folder/out.csv"], "hint: mkdir -p no/such/folder"),
         (["estimate", "m.toml", "x", "-o", "out.gpx"], ".csv, .csv.gz or .parquet is expected"),
         (["estimate", "m.toml", "x", "--level", "0"], "a probability"),
+        (["estimate", "-", "-"], "both claim standard input"),
+        (["estimate", "m.toml", "x", "--method", "KalmanFiltr"], "hint: KalmanFilter"),
     ],
 )
 def test_usage(args, words, capsys):
@@ -436,3 +438,21 @@ def test_closed_standard_error_is_no_failure(log):
         )  # fmt: skip
         assert found.returncode == GOOD
         assert found.stdout
+
+
+def test_track_and_report_need_two_files(log, tmp_path, capsys):
+    assert cli.run(["fill", str(log), "-o", str(tmp_path / "a.csv"), "--report", f"{tmp_path}/./a.csv"]) == USAGE
+    assert "both claim" in capsys.readouterr().err
+    assert not (tmp_path / "a.csv").exists()
+
+
+def test_a_state_called_like_the_time_is_refused(tmp_path, capsys):
+    (tmp_path / "m.toml").write_text(
+        'outputs = ["y"]\nstates = ["t"]\nA = [[1]]\nC = [[1]]\nw = { gaussian = 1.0 }\ne = { gaussian = 1.0 }\n'
+        "x0 = { mean = [0], covariance = [[1]] }\n"
+    )
+    (tmp_path / "d.csv").write_text("t,y\n0,1\n1,2\n")
+    assert cli.run(["estimate", str(tmp_path / "m.toml"), str(tmp_path / "d.csv")]) == BAD
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "a state is called 't'" in err

@@ -149,6 +149,8 @@ def fill(
         raise _usage("`--json` and an output of `-` both claim standard output", "-o FILE")
     if output == "-" and report == "-":
         raise _usage("`-o` and `--report` both claim standard output", "--report FILE")
+    if output is not None and report is not None and os.path.abspath(output) == os.path.abspath(report):
+        raise _usage(f"`-o` and `--report` both claim `{output}`", "--report drive.html")
     _method_known(method)
     for path in (output, report):
         _writable(path, log, force)
@@ -341,23 +343,27 @@ def estimate(
         raise _usage(f"`--level` is {level:g}, a probability between 0 and 1 is expected", "--level 0.9")
     if output != "-" and not output.lower().endswith((".csv", ".csv.gz", ".parquet")):
         raise _usage(f"`{output}` ends in no known format, .csv, .csv.gz or .parquet is expected", "-o states.csv")
+    if model == "-" and data == "-":
+        raise _usage("MODEL.toml and DATA both claim standard input", "give one of them as a file")
+    _estimator_known(method)
     _writable(output, data, force)
     spec, settings = _model_file(model)
-    name = method if method is not None else settings.pop("name", None)
+    name = settings.pop("name", None)
+    name = name if method is None else method
     job = Job("estimate", data, model=spec, method=name, settings=settings, level=level, seed=seed)
     with _working("estimating", quiet or no_progress):
         answer: Any = run(job)
     answer.check()
     table = _states(answer, level, spec.get("time", "t"))
-    if json_:
-        if output == "-":
-            output = ""
-        _print_json(_estimate_json(answer, level, output or None))
+    if json_ and output == "-":
+        output = ""
     if output:
         from halfwidth.store import atomic_write
 
         with _reader(), atomic_write(output) as file:
             file.write(_table_bytes(table, output))
+    if json_:
+        _print_json(_estimate_json(answer, level, output or None))
     if not quiet:
         _words(answer.summary(level), quiet)
         if output not in ("", "-"):
@@ -405,17 +411,28 @@ def _numbers(flag: str, text: str) -> list[float]:
 
 
 def _method_known(name: str | None) -> None:
-    """Refuse a method that is not there before any work is done."""
-    if name is None:
-        return
-    from halfwidth.vehicle.estimators import METHODS
+    """Refuse a method of the vehicle that is not there before any work is done."""
+    if name is not None:
+        from halfwidth.vehicle.estimators import METHODS
 
-    if name not in METHODS:
+        _one_of(name, list(METHODS))
+
+
+def _estimator_known(name: str | None) -> None:
+    """Refuse an estimator that is not there before any work is done."""
+    if name is not None:
+        from halfwidth.methods import ESTIMATORS
+
+        _one_of(name, list(ESTIMATORS))
+
+
+def _one_of(name: str, known: list[str]) -> None:
+    if name not in known:
         import difflib
 
-        near = difflib.get_close_matches(name, list(METHODS), n=1)
+        near = difflib.get_close_matches(name, known, n=1)
         raise _usage(
-            f"there is no method {name!r}, one of {', '.join(METHODS)} is expected",
+            f"there is no method {name!r}, one of {', '.join(known)} is expected",
             near[0] if near else "leave it away",
         )
 
@@ -560,6 +577,11 @@ def _estimate_json(answer: Any, level: float, output: str | None) -> dict[str, A
 def _states(answer: Any, level: float, time_name: str) -> dict[str, Any]:
     """Lay out the answer as columns: time, states, and their intervals."""
     names = answer.names or tuple(f"x{k}" for k in range(answer.x.shape[1]))
+    if time_name in names:
+        raise BadValue(
+            f"a state is called {time_name!r} as the time column is, so the answer would lack one of them",
+            hint="other names in `states`",
+        )
     columns = {time_name: answer.t} | {name: answer.x[:, k] for k, name in enumerate(names)}
     if answer.spread is not None:
         lo, hi = answer.interval(level)
