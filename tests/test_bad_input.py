@@ -48,6 +48,12 @@ CASES = {
     "F has other size": (lambda: linear(F=np.eye(2)), hw.BadShape, "`F`"),
     "E is not triangular": (lambda: linear(E=[[1.0, 0.0], [0.5, 1.0]]), hw.BadValue, "unit upper triangular"),
     "F has no unit diagonal": (lambda: linear(F=[[2.0]]), hw.BadValue, "unit upper triangular"),
+    "E as a function is not triangular": (
+        lambda: linear(E=lambda t: [[1.0, 0.0], [0.5, 1.0]]),
+        hw.BadValue,
+        "unit upper",
+    ),
+    "F as a function of dt has no unit diagonal": (lambda: linear(F=lambda dt: [[2.0]]), hw.BadValue, "unit upper"),
     "A holds inf": (lambda: linear(A=[[np.inf, 0], [0, 1]]), hw.BadValue, "inf"),
     "A is complex": (lambda: linear(A=1j * I2), hw.BadValue, "complex"),
     "A is text": (lambda: linear(A=[["a", "b"], ["c", "d"]]), hw.BadValue, "numbers"),
@@ -193,6 +199,25 @@ CASES = {
         lambda: hw.score(hw.estimate(linear(), hw.Record([0.0], [1.0])), np.ones((1, 2)), during=(5, 6)),
         hw.BadValue,
         "no row",
+    ),
+    "outputs that are not there": (
+        lambda: hw.Record([0.0, 1.0], [1.0, 2.0]).without(0, 1, outputs=[3]),
+        hw.BadValue,
+        "columns from 0 to 0",
+    ),
+    "a seed below 0": (lambda: hw.simulate(linear(), T=3, seed=-1), hw.BadValue, "`seed` is -1"),
+    "a seed that is text": (
+        lambda: hw.estimate(linear(), hw.Record([0.0], [1.0]), hw.ParticleFilter(), seed="a"),
+        hw.BadValue,
+        "`seed` is 'a'",
+    ),
+    "learn from a number": (lambda: hw.learn(linear(), 5), hw.BadRecord, "holds no Record"),
+    "g takes the step second": (
+        lambda: hw.Nonlinear(
+            lambda x, dt: x * dt, lambda x: x, hw.Gaussian(1.0), hw.Gaussian(1.0), hw.Normal([0.0], 1.0)
+        ),
+        hw.BadValue,
+        "lambda x, u, dt",
     ),
     "level out of range": (
         lambda: hw.estimate(linear(), hw.Record([0.0], [1.0])).interval(90),

@@ -85,3 +85,7 @@ def test_the_caller_keeps_his_arrays():
     record = hw.Record([0.0, 1.0, 2.0], y)
     y[0] = 7.0
     assert record.y[0, 0] == 1.0
+
+
+def test_counts_of_numpy_are_whole_numbers():
+    assert len(hw.Record([0.0, 1.0], [1.0, 2.0]).extended(np.int64(3))) == 5

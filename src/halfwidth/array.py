@@ -55,6 +55,14 @@ def extended(value: ArrayLike, name: str) -> Array:
     return array
 
 
+def generator(seed: int | np.random.Generator | None) -> np.random.Generator:
+    """Return the random generator of a seed, which is a whole number not below 0, or None for a fresh one."""
+    try:
+        return np.random.default_rng(seed)
+    except (TypeError, ValueError):
+        raise BadValue(f"`seed` is {seed!r}, a whole number not below 0 was expected", hint="seed=1") from None
+
+
 def of_size(value: Array, n: int, name: str, expected: str) -> Array:
     """Return a scalar repeated or a vector checked to (n,)."""
     if value.ndim == 0:

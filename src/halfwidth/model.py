@@ -130,8 +130,8 @@ class Linear:
         c = _matrix(C, "C", (None, nx), f"`A` {a.shape}")
         ny = c.shape[0]
         b = None if B is None else _matrix(B, "B", (nx, None), f"`A` {a.shape}")
-        ee = None if E is None else _triangular(_matrix(E, "E", (nx, nx), f"`A` {a.shape}"))
-        ff = None if F is None else _triangular(_matrix(F, "F", (ny, ny), f"`C` {c.shape}"))
+        ee = None if E is None else _matrix(E, "E", (nx, nx), f"`A` {a.shape}", _triangular)
+        ff = None if F is None else _matrix(F, "F", (ny, ny), f"`C` {c.shape}", _triangular)
         put = object.__setattr__
         put(self, "A", a)
         put(self, "B", b)
@@ -257,6 +257,10 @@ class Nonlinear:
         mean = np.atleast_1d(self.x0.mean)
         nx = len(mean)
         put(self, "nx", nx)
+        if _takes_step_second(self.g):
+            raise BadValue(
+                "the second argument of `g` is called `dt`, but it is the input", hint="g = lambda x, u, dt: ..."
+            )
         moved = self.move(mean, np.zeros(self.nu) if self.nu else None, float(self.dt))
         if moved.shape != (nx,):
             raise BadShape(f"`g` returned shape {moved.shape}, ({nx},) was expected from `x0`")
@@ -400,6 +404,13 @@ def arity(function: Callable[..., Any], most: int) -> int:
     )
 
 
+def _takes_step_second(function: Callable[..., Any]) -> bool:
+    try:
+        return list(inspect.signature(function).parameters)[1:2] == ["dt"]
+    except (TypeError, ValueError):
+        return False
+
+
 def _called(function: Callable[..., Any], name: str, arguments: tuple[Any, ...]) -> Array:
     try:
         value = function(*arguments)
@@ -449,17 +460,16 @@ def _matrix(
     name: str,
     shape: tuple[int | None, int | None],
     expected: str,
+    check: Callable[[Array, str], Array] | None = None,
 ) -> Varying:
     if isinstance(value, Varying):
         return value
-    return varying(value, name, shape, expected=expected, unknown=True)
+    return varying(value, name, shape, expected=expected, unknown=True, check=check)
 
 
-def _triangular(matrix: Varying) -> Varying:
-    if matrix.value is not None:
-        diagonal = np.diagonal(matrix.value, axis1=-2, axis2=-1)
-        if np.any(np.tril(matrix.value, -1) != 0) or np.any(diagonal != 1):
-            raise BadValue(f"`{matrix.name}` is not unit upper triangular: ones on the diagonal, zeros below")
+def _triangular(matrix: Array, name: str) -> Array:
+    if np.any(np.tril(matrix, -1) != 0) or np.any(np.diagonal(matrix, axis1=-2, axis2=-1) != 1):
+        raise BadValue(f"`{name}` is not unit upper triangular: ones on the diagonal, zeros below")
     return matrix
 
 

@@ -137,6 +137,8 @@ class Record:
         y = self.y.copy()
         rows = np.flatnonzero((self.t >= t0) & (self.t <= t1))
         columns = np.arange(self.ny) if outputs is None else np.asarray(outputs)
+        if np.any((columns < 0) | (columns >= self.ny)):
+            raise BadValue(f"`outputs` is {outputs!r}, columns from 0 to {self.ny - 1} were expected")
         y[np.ix_(rows, columns)] = np.nan
         return Record(self.t, y, self.u, self.labels)
 
@@ -151,7 +153,7 @@ class Record:
         u : (steps, nu) array_like, optional
             Inputs of the new rows; needed if the record has inputs.
         """
-        if not isinstance(steps, int) or steps < 1:
+        if not isinstance(steps, int | np.integer) or steps < 1:
             raise BadValue(f"`steps` is {steps!r}, a whole number from 1 was expected")
         if dt is None:
             dt = float(np.median(np.diff(self.t))) if len(self) > 1 else 1.0

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from halfwidth.array import Array, real
+from halfwidth.array import Array, generator, real
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record
@@ -107,7 +107,7 @@ def simulate(
     if isinstance(model, Linear) and model.theta_entries:
         raise BadValue(f"the model has unknown entries {model.theta_entries}, numbers were expected to simulate")
 
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     dt = np.diff(when, prepend=when[0] - model.dt)
     x0 = np.atleast_1d(model.x0.sample(rng))
     w = model.w.sample(rng, when, dt)

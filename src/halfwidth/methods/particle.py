@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from halfwidth.array import Array
+from halfwidth.array import Array, generator
 from halfwidth.errors import BadValue
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear, arity
@@ -96,8 +96,8 @@ class ParticleFilter:
 
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:
         """Estimate the states; see `halfwidth.estimate`."""
-        entropy = np.random.SeedSequence(seed).entropy
-        rng = np.random.default_rng(entropy)
+        rng = generator(seed)
+        entropy = rng.bit_generator.seed_seq.entropy
         T, N, nx = len(record), self.particles, model.nx
         dt = record.steps(model.dt)
         motion = _motion(model, record, dt, compiled_=self.compiled)
