@@ -492,7 +492,7 @@ def _semidefinite(S: Array) -> Array:
     value, vector = np.linalg.eigh(S / np.outer(d, d))
     if value[0] >= 0:
         return S
-    return (vector * np.maximum(value, 0.0)) @ vector.T * np.outer(d, d)
+    return np.asarray((vector * np.maximum(value, 0.0)) @ vector.T * np.outer(d, d))
 
 
 def _covariance(model: Linear, name: str) -> Varying:

@@ -534,3 +534,55 @@ def test_redundancy_counts_the_degrees_of_freedom():
         model, record, _ = draw(seed, T=40, lost=0.0)
         totals.append(hw.estimate(model, record, BatchLP(point="optimal")).info["redundancy"].sum())
     assert np.mean(totals) == pytest.approx(2 * 40 - 3, rel=0.1)
+
+
+def _by_highs(A, C, y, prior, box, cap):
+    """The paper's program with a dense matrix and nothing scaled: its optimal value."""
+    from scipy.optimize import linprog
+
+    (T, ny), nx = y.shape, len(A)
+    n = nx * (T + 1)
+    rows, right = [], []
+    for t in range(T):
+        now, before = slice(nx * (t + 1), nx * (t + 2)), slice(nx * t, nx * (t + 1))
+        blocks = [(np.eye(nx)[i], -A[i], n + i, 0.0) for i in range(nx)]
+        blocks += [(C[j], np.zeros(nx), n + nx + j, y[t, j]) for j in np.flatnonzero(~np.isnan(y[t]))]
+        for one, other, width, value in blocks:
+            for sign in (1.0, -1.0):
+                row = np.zeros(n + nx + ny)
+                row[now], row[before], row[width] = sign * one, sign * other, -1.0
+                rows.append(row)
+                right.append(sign * value)
+    ends = [(-end, end) for end in prior] + [(-box, box)] * (nx * T) + [(0, cap)] * (nx + ny)
+    return linprog(np.r_[np.zeros(n), np.ones(nx + ny)], np.array(rows), np.array(right), bounds=ends).fun
+
+
+def test_small_random_programs_also_of_growing_models_and_of_data_that_fit_exactly():
+    rng = np.random.default_rng(5)
+    unknown = hw.Uniform.unknown(0, 5)
+    for _ in range(40):
+        nx, ny, T = rng.integers(1, 4), rng.integers(1, 3), rng.integers(1, 8)
+        A, C, y = rng.normal(size=(nx, nx)), rng.normal(size=(ny, nx)), rng.normal(size=(T, ny))
+        y[rng.random(y.shape) < 0.3] = np.nan
+        model = hw.Linear(A, None, C, unknown, unknown, hw.Box(-3, 3), bounds=(-10, 10))
+        est = hw.estimate(model, hw.Record(np.arange(T), y), hw.BatchLP(objective="paper")).check()
+        np.testing.assert_allclose(est.q.sum() + est.r.sum(), _by_highs(A, C, y, [3] * nx, 10, 5), rtol=1e-5, atol=1e-5)
+
+
+def test_data_that_fit_exactly_outside_of_the_prior():
+    unknown = hw.Uniform.unknown(0, 5)
+    car = hw.Linear([[1, 1], [0, 1]], None, [[1, 0]], unknown, unknown, hw.Box([-3, -0.1], [3, 0.1]))
+    y = 2.0 * np.arange(4.0)
+    est = hw.estimate(car, hw.Record(np.arange(4), y), hw.BatchLP(objective="paper")).check()
+    best = _by_highs(car.A.single, car.C.single, y[:, None], [3, 0.1], np.inf, 5)
+    np.testing.assert_allclose(est.q.sum() + est.r.sum(), best, rtol=1e-5)
+    assert best > 1.0
+
+
+def test_growing_caps_is_advised_only_where_there_are_caps():
+    record = hw.Record([0, 1, 2], [0.0, 5.0, 0.0])
+    for noise, advised in ((hw.Uniform(0.1), False), (hw.Uniform.unknown(at_most=0.1), True)):
+        walk = hw.Linear([[1]], None, [[1]], noise, noise, hw.Box(-1, 1))
+        est = hw.estimate(walk, record, hw.BatchLP())
+        assert est.status is hw.Status.INFEASIBLE
+        assert ("grow_caps" in est.info["hint"]) == advised

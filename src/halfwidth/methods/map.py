@@ -70,6 +70,9 @@ _STATUS = {
 _RELAX = (1e-6, 1e-4)
 #: Residuals, half-widths and excesses below this share of sigma count as 0.
 _ZERO = 1e-5
+#: Residuals of the reference below this share of sigma are rounding: where it fits exactly they would otherwise set the
+#: size of the whole program.
+_ROUNDING = 1e-9
 #: Steps of majorise-minimise for the logarithmic objective.
 _ROUNDS = 12
 
@@ -263,6 +266,7 @@ class BatchLP:
     ) -> Estimate:
         """Say which rows conflict, and what would reconcile them."""
         factor, inflated = task.inflation(solvers, np.ones_like(task.free))
+        capped = bool(np.any(task.free & np.isfinite(task.highest)))
         excess, least = task.elastic(solvers)
         conflicts = [] if excess is None else task.conflicts(excess, model, record)
         X = next((v for v in (inflated, least) if v is not None), task.base.X)
@@ -280,7 +284,8 @@ class BatchLP:
             "solver": found.solver,
             "iterations": found.iterations,
             "notes": [],
-            "hint": "BatchLP(grow_caps=True), or make the outputs that info['conflicts'] names missing",
+            "hint": ("BatchLP(grow_caps=True), or " if capped and not self.grow_caps else "")
+            + "make the outputs that info['conflicts'] names missing",
         }
         return self._estimate(model, record, task.clipped(X), None, Status.INFEASIBLE, info)
 
@@ -364,6 +369,7 @@ class _Task:
         assert isinstance(model.x0, Box)
         scale = rows.S @ base.sigma
         back = sp.diags_array(1.0 / scale)
+        rho = rows.at(base.X) / scale
         box = model.bounds or Box(np.full(rows.nx, -np.inf), np.full(rows.nx, np.inf))
         x_lo = np.r_[model.x0.lo, np.tile(box.lo, rows.T)]
         x_hi = np.r_[model.x0.hi, np.tile(box.hi, rows.T)]
@@ -377,7 +383,7 @@ class _Task:
             rows,
             base,
             sp.csr_array(back @ rows.M @ sp.diags_array(base.column)),
-            rows.at(base.X) / scale,
+            np.where(np.abs(rho) > _ROUNDING, rho, 0.0),
             sp.csr_array(back @ rows.S @ sp.diags_array(base.sigma)),
             lo,
             hi,

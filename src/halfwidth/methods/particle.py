@@ -96,8 +96,8 @@ class ParticleFilter:
 
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:
         """Estimate the states; see `halfwidth.estimate`."""
-        rng = generator(seed)
-        entropy = rng.bit_generator.seed_seq.entropy
+        entropy = generator(seed).bit_generator.seed_seq.entropy  # type: ignore[attr-defined]
+        rng = np.random.default_rng(entropy)
         T, N, nx = len(record), self.particles, model.nx
         dt = record.steps(model.dt)
         motion = _motion(model, record, dt, compiled_=self.compiled)
