@@ -5,7 +5,10 @@
 
 namespace nb = nanobind;
 
+void bind_loss(nb::module_& m);
+
 NB_MODULE(_core, m) {
+    bind_loss(m);
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
     m.def("isa", [] { return hw::isa() == hw::Isa::avx2 ? "avx2" : "base"; },
           "The instruction set the kernels run with: \"avx2\" or \"base\".");
