@@ -5,13 +5,19 @@
 
 namespace nb = nanobind;
 
+void bind_kalman(nb::module_& m);
+void bind_tape(nb::module_& m);
+void bind_nonlinear(nb::module_& m);
 void bind_loss(nb::module_& m);
 
 NB_MODULE(_core, m) {
-    bind_loss(m);
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
     m.def("isa", [] { return hw::isa() == hw::Isa::avx2 ? "avx2" : "base"; },
           "The instruction set the kernels run with: \"avx2\" or \"base\".");
     m.def("use_isa", [](bool avx2) { return hw::use_isa(avx2 ? hw::Isa::avx2 : hw::Isa::base); }, nb::arg("avx2"),
           "Run the kernels with AVX2 or without; False if this machine cannot. For tests.");
+    bind_kalman(m);
+    bind_tape(m);
+    bind_nonlinear(m);
+    bind_loss(m);
 }

@@ -22,6 +22,8 @@ _HOME: dict[str, str] = {
     "Box": "spread",
     "Normal": "spread",
     "Cloud": "spread",
+    "Bernoulli": "loss",
+    "Markov": "loss",
     "Linear": "model",
     "Nonlinear": "model",
     "Record": "record",

@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from halfwidth.array import Array, Function, real
+from halfwidth.derivative import differences
 from halfwidth.errors import BadShape, BadValue, Refused
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
 from halfwidth.spread import Box, Normal
+from halfwidth.trace import Untraceable, compiled
 from halfwidth.varying import Varying, varying
 
 Prior = Box | Normal
@@ -37,6 +39,15 @@ class Entry(NamedTuple):
     matrix: str
     row: int
     column: int
+
+
+class Linearised(NamedTuple):
+    """Values and Jacobians of a nonlinear model at one point."""
+
+    g: Array
+    g_x: Array
+    h: Array
+    h_x: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +257,7 @@ class Nonlinear:
         mean = np.atleast_1d(self.x0.mean)
         nx = len(mean)
         put(self, "nx", nx)
-        moved = self.move(mean, np.zeros(self.nu), float(self.dt))
+        moved = self.move(mean, np.zeros(self.nu) if self.nu else None, float(self.dt))
         if moved.shape != (nx,):
             raise BadShape(f"`g` returned shape {moved.shape}, ({nx},) was expected from `x0`")
         seen = _called(self.h, "h", (mean.copy(),))
@@ -276,6 +287,85 @@ class Nonlinear:
     def output(self, x: Array) -> Array:
         """Return ``h(x)``, (ny,)."""
         return _called(self.h, "h", (x.copy(),))
+
+    def linearise(
+        self, x: ArrayLike, u: ArrayLike | None = None, dt: float | None = None, *, by: str | None = None
+    ) -> "Linearised":
+        """Return values and Jacobians of `g` and `h` at one point.
+
+        Parameters
+        ----------
+        x : (nx,) array_like
+        u : (nu,) array_like, optional
+            Zero if absent.
+        dt : float, optional
+            Step, s; the model's if absent.
+        by : {"user", "tape", "differences"}, optional
+            Where Jacobians come from; the user's where given, else exact from a tape, else finite differences.
+
+        Returns
+        -------
+        Linearised
+            Named tuple of g (nx,), g_x (nx, nx), h (ny,), h_x (ny, nx).
+
+        Raises
+        ------
+        BadShape, BadValue
+            If a function fails, or `by` cannot be had.
+
+        Examples
+        --------
+        >>> from halfwidth import Gaussian, Normal
+        >>> swing = Nonlinear(np.sin, lambda x: x**2, Gaussian(0.1), Gaussian(0.1), Normal([0.0], 1.0))
+        >>> swing.linearise([2.0]).h_x
+        array([[4.]])
+        """
+        if by not in (None, "user", "tape", "differences"):
+            raise BadValue(f"`by` is {by!r}, one of 'user', 'tape', 'differences' was expected")
+        point = real(x, "x")
+        if point.shape != (self.nx,):
+            raise BadShape(f"`x` has shape {point.shape}, ({self.nx},) was expected from the model")
+        given = (np.zeros(self.nu) if u is None else real(u, "u")) if self.nu else None
+        if given is not None and given.shape != (self.nu,):
+            raise BadShape(f"`u` has shape {given.shape}, ({self.nu},) was expected from the model")
+        rest: tuple[Any, ...] = (given, self.dt if dt is None else float(dt))
+        rows = []
+        for name, size, angles in (("g", self.nx, self.x_angles), ("h", self.ny, self.y_angles)):
+            f = getattr(self, name)
+            more = rest[: arity(f, 3 if name == "g" else 1) - 1]
+            rows += self._linearised(name, f, point, more, size, angles, by)
+        return Linearised(*rows)
+
+    def _linearised(
+        self,
+        name: str,
+        f: Callable[..., Any],
+        x: Array,
+        more: tuple[Any, ...],
+        size: int,
+        angles: tuple[int, ...],
+        by: str | None,
+    ) -> tuple[Array, Array]:
+        user = getattr(self, f"{name}_x")
+        value = _called(f, name, (x.copy(), *more))
+        if by == "user" and user is None:
+            raise BadValue(f"`by` is 'user' but the model has no `{name}_x`", hint="Nonlinear(..., g_x=..., h_x=...)")
+        if user is not None and by in (None, "user"):
+            wanted = arity(user, 3 if name == "g" else 1)
+            slope = np.atleast_2d(_called(user, f"{name}_x", (x.copy(), *more)[:wanted]))
+            if slope.shape != (size, self.nx):
+                raise BadShape(f"`{name}_x` returned shape {slope.shape}, ({size}, {self.nx}) was expected")
+            return value, slope
+        if by != "differences":
+            sizes = (self.nx, self.nu, None)[: 1 + len(more)]
+            try:
+                tape = compiled(f, sizes, [(x, *more)])
+            except Untraceable as reason:
+                if by == "tape":
+                    raise BadValue(f"`{name}` cannot be compiled: {reason}", hint="by='differences'") from reason
+            else:
+                return value, tape.jacobian(x, *more)[1][0]
+        return value, differences(lambda at: _called(f, name, (at, *more)), x, angles=angles)
 
     def as_gaussian(self) -> "Nonlinear":
         """Return the model with Gaussian noise of the same covariances; see `Linear.as_gaussian`."""

@@ -4,7 +4,18 @@ import importlib
 from typing import Any
 
 #: Exported estimators and the module of each; loaded when first used.
-ESTIMATORS: dict[str, str] = {}
+ESTIMATORS: dict[str, str] = {
+    "ExtendedKalman": "nonlinear",
+    "UnscentedKalman": "nonlinear",
+    "ParticleFilter": "particle",
+    "BKF1": "loss",
+    "BKF2": "loss",
+    "GPB": "loss",
+    "RBPF": "loss",
+    "FearnheadClifford": "loss",
+    "Runnalls": "loss",
+    "BeamSearch": "loss",
+}
 
 
 def load(name: str) -> Any:
