@@ -73,8 +73,8 @@ hw::LossState settings(int n, int m, int M, int G, int K, int rule, int depth, b
 }
 
 // A state together with its memory.
-struct Owner {
-    explicit Owner(const hw::LossState& sizes) : s(sizes) {
+struct Memory {
+    explicit Memory(const hw::LossState& sizes) : s(sizes) {
         long n_int = 0;
         const long n = HW_PICK(loss_place)(s, nullptr, nullptr, &n_int);
         d = std::make_unique<Buffer>(static_cast<std::size_t>(n));
@@ -96,7 +96,7 @@ nb::dict filter(In A, std::optional<In> b, In Q, In C, std::optional<In> d, In R
                 double threshold, std::uint64_t seed, bool prior_predicted, int smooth, int lag) {
     want(y.ndim() == 2 && seen.size() == y.size() && C.ndim() == 4, "y (T, m), seen (T, m), C (1 or T, M, m, n)");
     const std::size_t T = y.shape(0), m = y.shape(1), M = C.shape(1), n = x0.size(), G = static_cast<std::size_t>(groups);
-    Owner own(settings(int(n), int(m), int(M), groups, components, rule, depth, spread, learn, threshold, seed));
+    Memory own(settings(int(n), int(m), int(M), groups, components, rule, depth, spread, learn, threshold, seed));
     hw::LossState& s = own.s;
     hw::LossArgs k{};
     k.T = static_cast<int>(T);
@@ -151,9 +151,9 @@ nb::dict filter(In A, std::optional<In> b, In Q, In C, std::optional<In> d, In R
 }
 
 // A filter fed row by row. The model's matrices are kept between rows and may be replaced at any row.
-class Stream {
+class LossStream {  // not just Stream: nanobind tells types apart by name, across files
   public:
-    Stream(int n, int m, int M, int groups, int rule, int components, int depth, bool spread, int learn,
+    LossStream(int n, int m, int M, int groups, int rule, int components, int depth, bool spread, int learn,
            double threshold, std::uint64_t seed, In x0, In P0, In pi0, std::optional<In> count)
         : own(settings(n, m, M, groups, components, rule, depth, spread, learn, threshold, seed)),
           A(n * n), Q(n * n), b(n), C(M * m * n), d(M * m), R(M * m * m), logPi(M * M), y(m), seen(m) {
@@ -252,7 +252,7 @@ class Stream {
     }
 
   private:
-    Owner own;
+    Memory own;
     std::vector<double> A, Q, b, C, d, R, logPi, y;
     std::vector<unsigned char> seen;
 };
@@ -264,14 +264,14 @@ void bind_loss(nb::module_& m) {
           "pi0"_a, "count"_a.none(), nb::kw_only(), "groups"_a, "rule"_a, "components"_a, "depth"_a, "spread"_a, "learn"_a,
           "threshold"_a, "seed"_a, "prior_predicted"_a, "smooth"_a, "lag"_a,
           "Filter or smooth a record under a switching-measurement model.");
-    nb::class_<Stream>(m, "LossStream")
+    nb::class_<LossStream>(m, "LossStream")
         .def(nb::init<int, int, int, int, int, int, int, bool, int, double, std::uint64_t, In, In, In, std::optional<In>>(),
              nb::kw_only(), "n"_a, "m"_a, "modes"_a, "groups"_a, "rule"_a, "components"_a, "depth"_a, "spread"_a, "learn"_a,
              "threshold"_a, "seed"_a, "x0"_a, "P0"_a, "pi0"_a, "count"_a.none())
-        .def("motion", &Stream::motion, "A"_a, "Q"_a)
-        .def("output", &Stream::output, "C"_a, "R"_a)
-        .def("chain", &Stream::chain, "Pi"_a)
-        .def("push", &Stream::push, "y"_a, "b"_a.none(), "d"_a.none(), "predict"_a = true)
-        .def("state", &Stream::state)
-        .def("restore", &Stream::restore, "state"_a);
+        .def("motion", &LossStream::motion, "A"_a, "Q"_a)
+        .def("output", &LossStream::output, "C"_a, "R"_a)
+        .def("chain", &LossStream::chain, "Pi"_a)
+        .def("push", &LossStream::push, "y"_a, "b"_a.none(), "d"_a.none(), "predict"_a = true)
+        .def("state", &LossStream::state)
+        .def("restore", &LossStream::restore, "state"_a);
 }

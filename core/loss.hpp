@@ -593,17 +593,16 @@ inline void resample_children(N n, LossState& s, bool seen) {
         int sure = 0;
         while (sure < s.K - 1 && child_w(s, s.order[sure]) * (s.K - sure) >= rest) rest -= child_w(s, s.order[sure++]);
         const double c = rest / (s.K - sure);
-        for (; k < sure; k++) {
-            inherit(n, s, s.order[k], k, seen);
-            logw[k] = child_a(s, s.order[k]);
-        }
+        // In the children's own order, not by weight: equal weights must not make the draw hang on rounding.
         double u = c * uniform(s.rng);
-        for (int i = sure; i < alive && k < s.K; i++) {
-            u -= child_w(s, s.order[i]);
-            if (u >= 0.0) continue;
-            inherit(n, s, s.order[i], k, seen);
-            logw[k++] = std::log(c);
-            u += c;
+        for (int i = 0; i < children && k < s.K; i++) {
+            const double w = child_w(s, i);
+            if (!(w > 1e-14 * most)) continue;
+            const bool stays = w >= c;
+            if (!stays && (u -= w) >= 0.0) continue;
+            inherit(n, s, i, k, seen);
+            logw[k++] = stays ? child_a(s, i) : std::log(c);
+            if (!stays) u += c;
         }
     }
     double total = 0.0;
@@ -909,6 +908,7 @@ inline int step(N n, LossState& s, const LossRow& r, LossOut& o, LossPast* past,
 
 struct Smoother {
     int M, K;         // of the cells: child c = newest mode * K + i, partners before merging = M neighbours
+    bool decided;     // hard decisions: one cell a row, the modes stay as they were
     double *sw, *sx, *sP, *pw, *px, *pP, *work;
 };
 
@@ -999,16 +999,19 @@ inline void smooth_back(N n, const double* A, const double* b, const double* Q, 
 
 // What the smoothed cells of a row say: the mixture's moments and the modes.
 template <class N>
-inline void smooth_out(N n, const Smoother& f, double* x, double* P, double* modes, double* pairs) {
+inline bool smooth_out(N n, const Smoother& f, double* x, double* P, double* modes, double* pairs) {
     const int cells = f.M * f.K;
-    collapse(n, f, 0, 1, cells, x, P, f.work);
-    if (f.M == 1) return;  // hard decisions stay as they were
-    double total = 0.0;
-    for (int c = 0; c < cells; c++) total += f.sw[c];
+    double *xs = f.work + n, *Ps = xs + n;
+    const double total = collapse(n, f, 0, 1, cells, xs, Ps, f.work);
+    if (!(total > 0.0) || !all_finite(n, xs) || !all_finite(Dim<0>(n * n), Ps)) return false;  // the filter's answer stays
+    copy(n, xs, x);
+    copy(Dim<0>(n * n), Ps, P);
+    if (f.decided) return true;
     for (int q = 0; q < f.M; q++) modes[q] = 0.0;
     for (int c = 0; c < cells; c++) modes[c / f.K] += f.sw[c] / total;
     if (pairs && f.K >= f.M)
         for (int c = 0; c < cells; c++) pairs[c % f.K / (f.K / f.M) * f.M + c / f.K] += f.sw[c] / total;
+    return true;
 }
 
 // ---- a whole record ------------------------------------------------------------------------------------------------
@@ -1022,15 +1025,18 @@ inline int filter(N n, LossState& s, LossArgs& k) {
         for (int i = 0; i < s.M * s.M; i++) s.logPi[i] = log_or_minus_inf(k.Pi[t * k.sPi + i]);
     };
     log_pi(0);
-    Smoother f{s.rule == loss_decide ? 1 : s.M, s.rule == loss_decide ? 1 : s.K,
+    Smoother f{s.rule == loss_decide ? 1 : s.M, s.rule == loss_decide ? 1 : s.K, s.rule == loss_decide,
                k.sw, k.sx, k.sP, k.pw, k.px, k.pP, s.work};
     auto back_to = [&](int t) {
         smooth_back(n, k.A + (t + 1) * k.sA, k.b ? k.b + (t + 1) * k.sb : nullptr, k.Q + (t + 1) * k.sQ, k.past,
                     t % k.past.slots, f);
     };
     auto tell = [&](int t, bool pairs) {
-        smooth_out(n, f, k.x + static_cast<long>(t) * n, k.P + static_cast<long>(t) * n * n,
-                   k.modes + static_cast<long>(t) * s.M, pairs && t > 0 ? k.pairs : nullptr);
+        if (!smooth_out(n, f, k.x + static_cast<long>(t) * n, k.P + static_cast<long>(t) * n * n,
+                        k.modes + static_cast<long>(t) * s.M, pairs && t > 0 ? k.pairs : nullptr)) {
+            code = loss_not_finite;
+            if (*k.bad_row < 0 || t < *k.bad_row) *k.bad_row = t;
+        }
     };
     int last = k.T - 1;
     for (int t = 0; t < k.T; t++) {

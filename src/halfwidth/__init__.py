@@ -58,6 +58,15 @@ if TYPE_CHECKING:
     from halfwidth.errors import Refused as Refused
     from halfwidth.errors import Unsolved as Unsolved
     from halfwidth.estimate import estimate as estimate
+    from halfwidth.loss import Bernoulli as Bernoulli
+    from halfwidth.loss import Markov as Markov
+    from halfwidth.methods.loss import BKF1 as BKF1
+    from halfwidth.methods.loss import BKF2 as BKF2
+    from halfwidth.methods.loss import GPB as GPB
+    from halfwidth.methods.loss import RBPF as RBPF
+    from halfwidth.methods.loss import BeamSearch as BeamSearch
+    from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
+    from halfwidth.methods.loss import Runnalls as Runnalls
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
     from halfwidth.model import Linear as Linear

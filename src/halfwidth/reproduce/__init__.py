@@ -1,0 +1,1 @@
+"""The source papers' numbers beside ours: one module a paper, each with ``main``."""
