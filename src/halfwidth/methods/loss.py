@@ -767,6 +767,13 @@ class LossStream:
         return _tangent(model, self._x if moves else None, self._x, np.sqrt(np.diagonal(self._P)), u, dt, self.t + dt, y)
 
 
+def _whole(method: Any, name: str, least: int) -> None:
+    """Check a setting that counts something."""
+    value = getattr(method, name, least)
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise BadValue(f"`{name}` is {value!r}, a whole number from {least} was expected")
+
+
 def _matrices(model: Model) -> list[Any]:
     return list(model.matrices.values()) if isinstance(model, Linear) else []
 
