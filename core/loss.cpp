@@ -43,7 +43,7 @@ long loss_place(LossState& s, double* d, int* i, long* n_int) {
     need(m * m);
     need(2 * size + 4 * G);
     need(8 * n * n + 6 * n);
-    need(K);
+    need(B * lanes);
     need(M);
     if (s.rule == loss_merge) need(pool * (size + 2 + 4 * G + pool) + 2 * size);
     take(s.work, work);

@@ -328,8 +328,14 @@ inline void mode_priors(LossState& s, const double* logPi) {
         for (int q = 0; q < s.M; q++)
             for (int i = 0; i < s.live; i++) s.a[q * bank + i] = lp[q];
     } else if (!s.learn) {
-        for (int q = 0; q < s.M; q++)
-            for (int i = 0; i < s.live; i++) s.a[q * bank + i] = logPi[s.mode[i] * s.M + q];
+        for (int q = 0; q < s.M; q++) {
+            bool same = true;  // independent losses: nothing to look up
+            for (int j = 1; j < s.M; j++) same = same && logPi[j * s.M + q] == logPi[q];
+            if (same)
+                for (int b = 0; b < blocks(s.live); b++) v4(s.a)[q * bank / lanes + b] = all4(logPi[q]);
+            else
+                for (int i = 0; i < s.live; i++) s.a[q * bank + i] = logPi[s.mode[i] * s.M + q];
+        }
     } else {
         for (int i = 0; i < s.live; i++) {
             for (int q = 0; q < s.M; q++) lp[q] = 0.0;
@@ -617,21 +623,22 @@ inline void resample_children(N n, LossState& s, bool seen) {
 template <class N>
 inline void draw(N n, LossState& s, bool seen) {
     const int B = blocks(s.live), bank = blocks(s.K);
+    double* W = s.work;  // (K)
     for (int b = 0; b < B; b++) {
+        V4 u, sum{};
+        for (int l = 0; l < lanes; l++) u[l] = uniform(s.rng);
+        for (int q = 0; q < s.M; q++) sum += v4(s.w)[static_cast<long>(q) * bank + b];
+        v4(W)[b] = sum;
+        u *= sum;
         I4 chosen{};
-        for (int l = 0; l < lanes; l++) {
-            const int i = b * lanes + l;
-            if (i >= s.live) break;
-            double sum = 0.0;
-            for (int q = 0; q < s.M; q++) sum += s.w[(static_cast<long>(q) * bank + b) * lanes + l];
-            double u = sum * uniform(s.rng);
-            int q = 0;
-            for (; q < s.M - 1; q++) {
-                u -= s.w[(static_cast<long>(q) * bank + b) * lanes + l];
-                if (u < 0.0) break;
-            }
-            while (q > 0 && s.w[(static_cast<long>(q) * bank + b) * lanes + l] == 0.0) q--;  // rounding at the top end
-            chosen[l] = q;
+        V4 below{};
+        for (int q = 1; q < s.M; q++) {  // the last mode that starts below u and is possible
+            below += v4(s.w)[static_cast<long>(q - 1) * bank + b];
+            const I4 here = (u >= below) & (v4(s.w)[static_cast<long>(q) * bank + b] > V4{});
+            chosen = here ? I4{q, q, q, q} : chosen;
+        }
+        for (int l = 0; l < lanes && b * lanes + l < s.live; l++) {
+            const int i = b * lanes + l, q = static_cast<int>(chosen[l]);
             if (s.learn) {
                 double* c = s.count + static_cast<long>(i) * s.G * 4;
                 count_child(s, c, s.mode[i], q, seen, c);
@@ -649,11 +656,6 @@ inline void draw(N n, LossState& s, bool seen) {
         }
     }
     double sum = 0.0, squares = 0.0;
-    double* W = s.work;  // (K)
-    for (int b = 0; b < B; b++) {
-        const V4 e = exp4(v4(s.lw)[b]);
-        for (int l = 0; l < lanes && b * lanes + l < s.live; l++) W[b * lanes + l] = e[l];
-    }
     bool dead = false;
     for (int i = 0; i < s.live; i++) {
         s.logw[i] = s.lw[i];
@@ -662,7 +664,8 @@ inline void draw(N n, LossState& s, bool seen) {
         dead = dead || W[i] == 0.0;
     }
     if (!dead && sum * sum >= s.threshold * s.live * squares) return;
-    double u = uniform(s.rng), reached = 0.0;
+    const double u = uniform(s.rng), each = -std::log(static_cast<double>(s.K));
+    double reached = 0.0;
     int from = -1;
     for (int i = 0; i < s.K; i++) {
         while (from < s.live - 1 && reached * s.K <= (i + u) * sum) reached += W[++from];
@@ -671,7 +674,7 @@ inline void draw(N n, LossState& s, bool seen) {
         s.mode2[i] = s.mode[from];
         for (int j = 0; s.learn && j < s.G * 4; j++)
             s.count2[static_cast<long>(i) * s.G * 4 + j] = s.count[static_cast<long>(from) * s.G * 4 + j];
-        s.logw[i] = -std::log(static_cast<double>(s.K));
+        s.logw[i] = each;
     }
     swap_banks(s);
     s.live = s.K;

@@ -148,16 +148,12 @@ def rbpf(p, particles, seed, threshold=0.5):
 
     def rule(mix, children):
         new = []
+        draws = [next(u) for _ in range(-(-particles // 4) * 4)]  # the kernel draws for whole blocks
         for i in range(0, len(children), M):
             lw = np.array([c[1] for c in children[i : i + M]])
             w = np.exp(lw)
-            draw = w.sum() * next(u)
-            s = 0
-            while s < M - 1:
-                draw -= w[s]
-                if draw < 0:
-                    break
-                s += 1
+            starts = np.concatenate([[0.0], np.cumsum(w)[:-1]])
+            s = max(np.flatnonzero((starts <= w.sum() * draws[i // M]) & (w > 0)), default=0)
             h, _, x, P = children[i + s]
             new.append((h, logsumexp(lw), x, P))
         W = np.exp([c[1] for c in new])
