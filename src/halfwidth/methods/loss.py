@@ -632,6 +632,7 @@ class LossStream:
             message, _, hint = reason.partition("\nhint: ")
             raise Refused(message, hint=hint or None)
         self.method, self.model = method, model
+        self._seed = 0 if seed is None else int(seed)
         self.rows, self.loglik = 0, 0.0
         self.t = 0.0
         self._u = isinstance(model, Linear) and model.B is not None
@@ -642,12 +643,15 @@ class LossStream:
         self._P = np.array(model.x0.P)  # type: ignore[union-attr]
         self._layout: _Rows | None = None
         self._modes: Modes | None = None
-        first = self._modes_of(self._prepare(None, model.dt), np.zeros(model.ny))
-        self._core = _core.LossStream(
-            n=model.nx, m=model.ny, modes=first.C.shape[1], groups=1 if loss is None else len(loss.groups(model.ny)),
-            learn=0 if loss is None or loss.known else 1 if isinstance(loss, Bernoulli) else 2,
-            seed=0 if seed is None else int(seed), x0=self._x, P0=self._P, pi0=first.pi0, count=first.count,
-            **method._settings,
+        self._core: Any = None
+
+    def _begin(self, modes: Modes) -> Any:
+        """Return the kernel's object, at the prior."""
+        model, loss = self.model, self.model.loss
+        return _core.LossStream(
+            n=model.nx, m=model.ny, modes=modes.C.shape[1], groups=1 if loss is None else len(loss.groups(model.ny)),
+            learn=0 if loss is None or loss.known else 1 if isinstance(loss, Bernoulli) else 2, seed=self._seed,
+            x0=self._x, P0=self._P, pi0=modes.pi0, count=modes.count, **self.method._settings,
         )  # fmt: skip
 
     def push(self, y: Any, u: Any = None, dt: float | None = None) -> Newest:
@@ -668,12 +672,10 @@ class LossStream:
         if self._modes is not None and not self._stale and self._fixed:
             b = None if not self._u else self._input(u)
             found = self._core.push(y, b, self._offset, self.rows > 0 or self.method.prior == "filtered")
+            self._moved(found, step)
         else:
-            found = self._slow(y, u, step)
-        self.rows += 1
-        self.t += step
-        self.loglik += found[3]
-        self._x, self._P = found[0], found[1]
+            given = None if u is None else np.asarray(u, dtype=np.float64).reshape(-1)
+            found = self._push_rows(self._prepare(given, step, y), y, step)
         newest: Newest = object.__new__(Newest)
         object.__setattr__(newest, "_belief", _Belief(self, found, y))
         return newest
@@ -681,7 +683,7 @@ class LossStream:
     def linear_row(self, y: Array, u: Array | None, dt: float) -> tuple[Array, ...]:
         """Push a row and return the linear model (A, b, Q, C, R, d) that it was filtered with."""
         rows = self._prepare(u, dt, y)
-        self._push_rows(rows, y)
+        self._push_rows(rows, y, dt)
         return rows.A[0], rows.b[0], rows.Q[0], rows.C[0], rows.R[0], rows.d[0]  # type: ignore[index]
 
     def state(self) -> bytes:
@@ -712,19 +714,24 @@ class LossStream:
         self._last, self._x = head[3 : 3 + ny].copy(), head[3 + ny : 3 + ny + n].copy()
         self._P = head[3 + ny + n :].reshape(n, n).copy()
 
-    def _slow(self, y: Array, u: Any, dt: float) -> Any:
-        given = None if u is None else np.asarray(u, dtype=np.float64).reshape(-1)
-        return self._push_rows(self._prepare(given, dt, y), y)
+    def _moved(self, found: Any, dt: float) -> None:
+        self.rows += 1
+        self.t += dt
+        self.loglik += found[3]
+        self._x, self._P = found[0], found[1]
 
-    def _push_rows(self, rows: _Rows, y: Array) -> Any:
+    def _push_rows(self, rows: _Rows, y: Array, dt: float) -> Any:
         modes = self._set(rows, y)
         found = self._core.push(y, None if rows.b is None else rows.b[0], None if modes.d is None else modes.d[0],
                                 self.rows > 0 or self.method.prior == "filtered")  # fmt: skip
         self._last = np.where(np.isnan(y), self._last, y)
+        self._moved(found, dt)
         return found
 
     def _set(self, rows: _Rows, y: Array) -> Modes:
         modes = self._modes_of(rows, y)
+        if self._core is None:
+            self._core = self._begin(modes)
         self._core.motion(rows.A[0], rows.Q[0])
         self._core.output(modes.C[0], modes.R[0])
         self._core.chain(modes.Pi[-1])
@@ -733,12 +740,9 @@ class LossStream:
 
     def _modes_of(self, rows: _Rows, y: Array) -> Modes:
         """Return the modes of one row, the values reported before it standing above it."""
-        two = np.stack([self._last, y])
-        seen = ~np.isnan(two)
-        t = np.arange(2.0)
-        found = _modes(rows, self.model.loss, Record(t, two))[1] if self._stale else _modes(
-            rows, self.model.loss, Record(t[:1], two[1:]))[1]  # fmt: skip
-        del seen
+        above = [self._last] if self._stale and not np.isnan(self._last).all() else []
+        outputs = np.stack([*above, y])
+        found = _modes(rows, self.model.loss, Record(np.arange(len(outputs)) * 1.0, outputs))[1]
         return found._replace(d=None if found.d is None else found.d[-1:])
 
     def _input(self, u: Any) -> Array:
@@ -763,6 +767,7 @@ class LossStream:
                     self._B = np.stack([v[0] for v in unit if v is not None], axis=1)
             self._layout = rows
             return rows
+        u = np.zeros(model.nu) if u is None else u
         moves = self.rows > 0 or self.method.prior == "filtered"
         return _tangent(model, self._x if moves else None, self._x, np.sqrt(np.diagonal(self._P)), u, dt, self.t + dt, y)
 
