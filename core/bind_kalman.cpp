@@ -329,6 +329,7 @@ struct Stream {
     std::map<double, Matrices> of_dt;
     double last_dt;
     Matrices of_row;
+    nb::object error;  // the exception of a push that cannot be used
     nb::object given, type;  // callable (row, t, dt) -> matrices, or None; the type of what push returns
     bool every_row;
     std::vector<double> x, P, xl, Pl, y, u, ring, times, work;
@@ -380,26 +381,26 @@ inline bool number(PyObject* o, double& v) {
         return true;
     }
     v = PyFloat_AsDouble(o);
-    return !(v == -1.0 && PyErr_Occurred());
+    return !(v == -1.0 && PyErr_Occurred());  // a TypeError that names the type
 }
 
-bool wrong_count(const char* name, Py_ssize_t got, int n) {
-    PyErr_Format(PyExc_ValueError, "`%s` has %zd entries but the model has %d", name, got, n);
+bool wrong_count(PyObject* error, const char* name, Py_ssize_t got, int n) {
+    PyErr_Format(error, "`%s` has %zd entries but the model has %d", name, got, n);
     return false;
 }
 
 // n numbers from a list, tuple, float, buffer of float64 or anything with the sequence protocol.
-bool numbers(PyObject* o, double* to, int n, const char* name) {
+bool numbers(PyObject* error, PyObject* o, double* to, int n, const char* name) {
     if (PyList_CheckExact(o) || PyTuple_CheckExact(o)) {
         const Py_ssize_t got = PySequence_Fast_GET_SIZE(o);
-        if (got != n) return wrong_count(name, got, n);
+        if (got != n) return wrong_count(error, name, got, n);
         PyObject** items = PySequence_Fast_ITEMS(o);
         for (int i = 0; i < n; i++)
             if (!number(items[i], to[i])) return false;
         return true;
     }
     if (PyFloat_CheckExact(o) || PyLong_CheckExact(o)) {
-        if (n != 1) return wrong_count(name, 1, n);
+        if (n != 1) return wrong_count(error, name, 1, n);
         return number(o, to[0]);
     }
     if (PyObject_CheckBuffer(o)) {
@@ -412,7 +413,7 @@ bool numbers(PyObject* o, double* to, int n, const char* name) {
                 if (got == n)
                     for (int i = 0; i < n; i++) to[i] = *reinterpret_cast<double*>(static_cast<char*>(v.buf) + i * step);
                 PyBuffer_Release(&v);
-                return got == n || wrong_count(name, got, n);
+                return got == n || wrong_count(error, name, got, n);
             }
             PyBuffer_Release(&v);
         } else {
@@ -428,7 +429,7 @@ bool numbers(PyObject* o, double* to, int n, const char* name) {
         return false;
     }
     const Py_ssize_t got = PySequence_Fast_GET_SIZE(f);
-    bool ok = got == n || wrong_count(name, got, n);
+    bool ok = got == n || wrong_count(error, name, got, n);
     for (int i = 0; ok && i < n; i++) ok = number(PySequence_Fast_GET_ITEM(f, i), to[i]);
     Py_DECREF(f);
     return ok;
@@ -464,7 +465,7 @@ PyObject* answer(Stream& s, int code, int n_seen, double ll, double nis) {
 PyObject* push_impl(Stream& s, PyObject* y, PyObject* u, PyObject* dt_) {
     if (y == nullptr || y == Py_None) {
         for (int i = 0; i < s.ny; i++) s.y[i] = NAN;
-    } else if (!numbers(y, s.y.data(), s.ny, "y")) {
+    } else if (!numbers(s.error.ptr(), y, s.y.data(), s.ny, "y")) {
         return nullptr;
     }
     int n_seen = 0;
@@ -477,24 +478,24 @@ PyObject* push_impl(Stream& s, PyObject* y, PyObject* u, PyObject* dt_) {
             s.seen[i] = 0;
             s.y[i] = 0.0;
         } else {
-            return PyErr_Format(PyExc_ValueError, "`y` is infinite in entry %d; a missing entry is None or NaN", i);
+            return PyErr_Format(s.error.ptr(), "`y` is infinite in entry %d; a missing entry is None or NaN", i);
         }
     }
     if (s.nu > 0) {
         if (u == nullptr || u == Py_None)
-            return PyErr_Format(PyExc_ValueError, "`u` is missing; the model has %d inputs", s.nu);
-        if (!numbers(u, s.u.data(), s.nu, "u")) return nullptr;
+            return PyErr_Format(s.error.ptr(), "`u` is missing; the model has %d inputs", s.nu);
+        if (!numbers(s.error.ptr(), u, s.u.data(), s.nu, "u")) return nullptr;
         for (int i = 0; i < s.nu; i++)
             if (!(s.u[i] - s.u[i] == 0.0))
-                return PyErr_Format(PyExc_ValueError, "`u` is not finite in entry %d; only `y` may be missing", i);
+                return PyErr_Format(s.error.ptr(), "`u` is not finite in entry %d; only `y` may be missing", i);
     } else if (u != nullptr && u != Py_None) {
-        return PyErr_Format(PyExc_ValueError, "`u` was given but the model has no inputs");
+        return PyErr_Format(s.error.ptr(), "`u` was given but the model has no inputs");
     }
     double dt = s.dt;
     if (dt_ != nullptr && dt_ != Py_None) {
         if (!number(dt_, dt)) return nullptr;
         if (!(dt > 0.0) || !(dt - dt == 0.0))
-            return PyErr_Format(PyExc_ValueError, "`dt` must be a positive time in seconds");
+            return PyErr_Format(s.error.ptr(), "`dt` must be a positive time in seconds");
     }
     if (!s.given.is_none()) {
         try {
@@ -519,7 +520,7 @@ PyObject* push_impl(Stream& s, PyObject* y, PyObject* u, PyObject* dt_) {
             PyErr_SetString(PyExc_TypeError, "the callback returns (A, B, C, Q, R), float64 arrays in C order");
             return nullptr;
         } catch (const std::exception& e) {
-            PyErr_SetString(PyExc_ValueError, e.what());
+            PyErr_SetString(s.error.ptr(), e.what());
             return nullptr;
         }
     }
@@ -574,7 +575,7 @@ PyType_Slot stream_slots[] = {{Py_tp_methods, stream_methods}, {0, nullptr}};
 
 void stream_init(Stream* s, const Array& A, const Array& B, const Array& C, const Array& Q, const Array& R,
                  const Array& x0, const Array& P0, nb::object returned, std::int64_t lag, double dt, double t,
-                 nb::object matrices, bool every_row) {
+                 nb::object matrices, bool every_row, nb::object error) {
     need(A.ndim() == 2 && C.ndim() == 2 && B.ndim() == 2 && x0.ndim() == 1, "A, B, C have 2 axes and x0 has 1");
     need(lag >= 0 && lag <= 1000000, "lag is between 0 and 1000000");
     const std::size_t nx = A.shape(0), ny = C.shape(0), nu = B.shape(1);
@@ -595,6 +596,7 @@ void stream_init(Stream* s, const Array& A, const Array& B, const Array& C, cons
     s->now = &s->constant;
     s->given = std::move(matrices);
     s->every_row = every_row;
+    s->error = error.is_none() ? nb::borrow(PyExc_ValueError) : std::move(error);
     s->type = std::move(returned);
     if (!s->type.is_none()) {
         need(PyType_Check(s->type.ptr()), "the returned type is a class");
@@ -665,7 +667,8 @@ void bind_kalman(nb::module_& m) {
     nb::class_<Stream>(m, "KalmanStream", nb::type_slots(stream_slots),
                        "A Kalman filter that holds its belief: push rows, snapshot, restore.")
         .def("__init__", &stream_init, "A"_a, "B"_a, "C"_a, "Q"_a, "R"_a, "x0"_a, "P0"_a, "returned"_a.none() = nb::none(),
-             nb::kw_only(), "lag"_a = 0, "dt"_a = 1.0, "t"_a = 0.0, "matrices"_a.none() = nb::none(), "every_row"_a = false)
+             nb::kw_only(), "lag"_a = 0, "dt"_a = 1.0, "t"_a = 0.0, "matrices"_a.none() = nb::none(), "every_row"_a = false,
+             "error"_a.none() = nb::none())
         .def("snapshot", &stream_snapshot)
         .def("restore", &stream_restore, "snapshot"_a)
         .def_prop_ro("pushed", [](const Stream& s) { return s.pushed; })

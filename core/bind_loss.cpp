@@ -190,6 +190,7 @@ class LossStream {  // not just Stream: nanobind tells types apart by name, acro
         for (std::size_t i = 0; i < y.size(); i++) {
             const double v = y_.data()[i];
             seen[i] = !std::isnan(v);
+            want(!std::isinf(v), "an output is infinite");
             y[i] = seen[i] ? v : 0.0;
         }
         double *x, *P, *modes, *law = nullptr;

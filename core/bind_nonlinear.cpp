@@ -22,23 +22,22 @@ void expect(bool fits, const char* what) {
     if (!fits) throw nb::value_error(what);
 }
 
-// One matrix for all rows, one for each, or chosen by index: pointer, index and step.
-void stacked(const StackIn& value, const std::optional<IndexIn>& index, size_t n, size_t T, const double*& a,
-             const int32_t*& chosen, int& step) {
-    expect(value.shape(1) == n && value.shape(2) == n, "nonlinear_run: size of Q or R");
-    a = value.data();
-    chosen = nullptr;
-    step = 0;
+// (K, n, n): one matrix for all rows, one for each, or chosen by index.
+Stack stacked(const StackIn& value, const std::optional<IndexIn>& index, size_t n, size_t T) {
+    expect(value.shape(0) >= 1 && value.shape(1) == n && value.shape(2) == n, "nonlinear_run: size of Q or R");
+    Stack s;
+    s.a = value.data();
     if (index) {
         expect(index->shape(0) == T, "nonlinear_run: size of an index");
         for (size_t t = 0; t < T; ++t)
             expect(index->data()[t] >= 0 && (size_t)index->data()[t] < value.shape(0), "nonlinear_run: index out of range");
-        chosen = index->data();
+        s.index = index->data();
+        s.step = (std::ptrdiff_t)(n * n);
     } else if (value.shape(0) != 1) {
         expect(value.shape(0) == T, "nonlinear_run: length of Q or R");
-        step = 1;
+        s.step = (std::ptrdiff_t)(n * n);
     }
-    expect(value.shape(0) >= 1 || T == 0, "nonlinear_run: empty Q or R");
+    return s;
 }
 
 }  // namespace
@@ -74,8 +73,8 @@ void bind_nonlinear(nb::module_& m) {
         a.h = tape_h.tape;
         a.gu = gu.data();
         a.hu = hu.data();
-        stacked(Q, Q_index, nx, T, a.Q, a.Q_index, a.Q_step);
-        stacked(R, R_index, ny, T, a.R, a.R_index, a.R_step);
+        a.Q = stacked(Q, Q_index, nx, T);
+        a.R = stacked(R, R_index, ny, T);
         a.x0 = x0.data();
         a.P0 = P0.data();
         a.y = y.data();

@@ -72,10 +72,12 @@ void push(NX nx, NY ny, KalmanPush& k) {
 }  // namespace
 
 void kalman_filter(Kalman& k) {
+    FlushTiny scope;
     with_sizes(k.nx, k.ny, [&](auto nx, auto ny) { filter(nx, ny, k, Arena{k.work}); });
 }
 
 void kalman_smooth(Kalman& k) {
+    FlushTiny scope;
     with_sizes(k.nx, k.ny, [&](auto nx, auto ny) {
         const std::int64_t good = filter(nx, ny, k, Arena{k.work});
         smooth(nx, k, good, Arena{k.work});
@@ -83,6 +85,7 @@ void kalman_smooth(Kalman& k) {
 }
 
 void kalman_lag(Kalman& k) {
+    FlushTiny scope;
     with_sizes(k.nx, k.ny, [&](auto nx, auto ny) {
         const std::int64_t good = filter(nx, ny, k, Arena{k.work});
         smooth_lag(nx, k, good, Arena{k.work});
@@ -90,6 +93,7 @@ void kalman_lag(Kalman& k) {
 }
 
 void kalman_push(KalmanPush& k) {
+    FlushTiny scope;
     with_sizes(k.nx, k.ny, [&](auto nx, auto ny) { push(nx, ny, k); });
 }
 

@@ -14,7 +14,8 @@
 //
 // Singular systems. S = C P C' + R or P_p = A P A' + Q may be singular (R = 0, Q = 0, P0 = 0). A direction whose pivot
 // is only rounding noise is left out (small.hpp): an output without any variance cannot move the state. Such rows count as
-// `reduced`; when the output contradicts its certain prediction (beyond 1e-6 of its size) the code is `contradicted`.
+// `reduced`; when the output contradicts a certain prediction (beyond 1e-6 of its size) or an uncertain one (beyond a
+// million standard deviations) the code is `contradicted`.
 // When a belief leaves the range of floating point the pass stops: the rows from there on repeat the last finite belief
 // and the code is `broken`. No output is ever NaN.
 //
@@ -91,7 +92,7 @@ struct Kalman {
 // Entries of workspace for these sizes (lag < 0: no lag).
 inline std::int64_t kalman_work(std::int64_t nx, std::int64_t ny, std::int64_t lag = -1) {
     const std::int64_t n = nx > 0 ? nx : 1, m = ny > 0 ? ny : 1;
-    return 16 * n * n + 12 * n + 10 * m * m + 8 * n * m + 8 * m + 64 + (lag > 0 ? lag * (2 * n * n + 2 * n) : 0);
+    return 16 * n * n + 16 * n + 10 * m * m + 8 * n * m + 12 * m + 64 + (lag > 0 ? lag * (2 * n * n + 2 * n) : 0);
 }
 
 namespace HW_ISA {
@@ -117,6 +118,25 @@ struct Room<0> {
 template <class M, class N = Dim<1>>
 constexpr int room = M::fixed && N::fixed ? M::cap * N::cap : 0;
 
+constexpr double rounding = 64.0 * eps;
+
+// Whether some variance fell to rounding noise of what it was: that state is now certain, up to what R (or Q) adds.
+template <class NX>
+inline bool determined(NX nx, const double* P, const double* was) {
+    bool any = false;
+    for (int i = 0; i < nx; i++) any = any || P[i * nx + i] < rounding * was[i];
+    return any;
+}
+
+// Of such states keep the part M that was not found by cancellation: P stays positive semidefinite.
+template <class NX>
+inline void clear(NX nx, const double* M, const double* was, double* P) {
+    for (int i = 0; i < nx; i++) {
+        if (!(P[i * nx + i] < rounding * was[i])) continue;
+        for (int j = 0; j < nx; j++) P[i * nx + j] = P[j * nx + i] = M[i * nx + j];
+    }
+}
+
 // The correction by one output. Holds C', reused while C stays the same matrix.
 template <class NX, class NY>
 struct Correction {
@@ -125,9 +145,10 @@ struct Correction {
     Room<room<NY, NX>> Ct_, CP_, Kt_, Cm_, Cmt_;
     Room<room<NY, NY>> S_, L_, Rm_, RK_;
     Room<room<NX, NX>> Zt_, PZ_;
-    Room<room<NY>> d_, di_, v_, z_;
+    Room<room<NY>> d_, di_, v_, z_, floor_;
+    Room<room<NX>> var_;
     Room<room<NY, NX>> RKt_;
-    double *Ct, *CP, *Kt, *Cm, *Cmt, *S, *L, *Rm, *Zt, *PZ, *d, *di, *v, *z, *RKt;
+    double *Ct, *CP, *Kt, *Cm, *Cmt, *S, *L, *Rm, *Zt, *PZ, *d, *di, *v, *z, *floor, *var, *RKt;
     const double* C_of_Ct = nullptr;
     LogProduct dets;
     double ll_quad = 0.0;  // sum of v' S^-1 v
@@ -139,7 +160,8 @@ struct Correction {
         RKt = RKt_.get(w, nm);
         S = S_.get(w, mm); L = L_.get(w, mm); Rm = Rm_.get(w, mm);
         Zt = Zt_.get(w, nn); PZ = PZ_.get(w, nn);
-        d = d_.get(w, m); di = di_.get(w, m); v = v_.get(w, m); z = z_.get(w, m);
+        d = d_.get(w, m); di = di_.get(w, m); v = v_.get(w, m); z = z_.get(w, m); floor = floor_.get(w, m);
+        var = var_.get(w, n);
     }
 
     // log-likelihood of all rows since the last call of `forget`
@@ -181,10 +203,19 @@ struct Correction {
         mul(ny, nx, nx, c, P, CP);
         for (int i = 0; i < ny; i++) copy(ny, r + i * ny, S + i * ny);
         mul<Op::add>(ny, nx, ny, CP, ct, S);
+        for (int i = 0; i < nx; i++) var[i] = P[i * nx + i];
+        for (int i = 0; i < ny; i++) {  // what is left of C P C' after cancellation may be rounding only
+            floor[i] = 0.0;
+            if (r[i * ny + i] < 0.5 * S[i * ny + i] || !(S[i * ny + i] > 0.0)) {
+                for (int j = 0; j < nx; j++) floor[i] += c[i * nx + j] * c[i * nx + j] * var[j];
+                floor[i] *= rounding * nx;
+                if (!(S[i * ny + i] > floor[i])) for (int j = 0; j < ny; j++) S[i * ny + j] = S[j * ny + i] = 0.0;
+            }
+        }
         const int vanished = ldl(ny, S, L, d, di);
 
-        int code = kalman_ok;
-        if (vanished) code = vanished < 0 ? kalman_broken : kalman_reduced;
+        // A negative pivot is rounding of a belief already certain: left out as well. Overflow shows in x and P.
+        int code = vanished ? kalman_reduced : kalman_ok;
         double quad = 0.0, det = 0.0;
         for (int i = 0; i < ny; i++) {
             double s = v[i];
@@ -197,9 +228,10 @@ struct Correction {
                 if (ll) det += std::log(d[i]) + log_2pi;
             } else if (code == kalman_reduced) {
                 const double size = std::fabs(y[i]) + std::fabs(y[i] - v[i]) + std::sqrt(std::fabs(S[i * ny + i]));
-                if (std::fabs(s) > 1e-6 * size) code = kalman_contradicted;
+                if (std::fabs(s) > 1e-6 * size + 1e3 * std::sqrt(floor[i])) code = kalman_contradicted;
             }
         }
+        if (quad > 1e12) code = kalman_contradicted;
         if (k < ny) {  // the unit pivots of unseen entries are no data
             n_used -= ny - k;
             if (ll) det -= (ny - k) * log_2pi;
@@ -221,6 +253,11 @@ struct Correction {
         mul_tn(nx, nx, nx, Zt, PZ, P);
         mul_tn<Op::add>(nx, ny, nx, Kt, RKt, P);
         symmetrise(nx, P);
+        if (determined(nx, P, var)) {
+            mul_tn(nx, ny, nx, Kt, RKt, PZ);
+            symmetrise(nx, PZ);
+            clear(nx, PZ, var, P);
+        }
         return code;
     }
 };
@@ -266,14 +303,15 @@ template <class NX>
 struct Retrodiction {
     NX nx;
     Room<room<NX, NX>> AP_, Pp_, L_, Gt_, Zt_, W_, T_;
-    Room<room<NX>> d_, di_, xp_, dx_;
-    double *AP, *Pp, *L, *Gt, *Zt, *W, *T, *d, *di, *xp, *dx;
+    Room<room<NX>> d_, di_, xp_, dx_, var_;
+    double *AP, *Pp, *L, *Gt, *Zt, *W, *T, *d, *di, *xp, *dx, *var;
 
     Retrodiction(NX n, Arena& w) : nx(n) {
         const int nn = n * n;
         AP = AP_.get(w, nn); Pp = Pp_.get(w, nn); L = L_.get(w, nn); Gt = Gt_.get(w, nn); Zt = Zt_.get(w, nn);
         W = W_.get(w, nn); T = T_.get(w, nn);
         d = d_.get(w, n); di = di_.get(w, n); xp = xp_.get(w, n); dx = dx_.get(w, n);
+        var = var_.get(w, n);
     }
     // Gt (nx,nx) = G', Zt = I - A' G'
     inline void gain(const double* A, const double* At, const double* P, const double* Q) {
@@ -291,12 +329,18 @@ struct Retrodiction {
     }
     // out = Z P Z' + G W G', after `gain`
     inline void covariance(const double* P, const double* W_, double* out) {
+        for (int i = 0; i < nx; i++) var[i] = P[i * nx + i];
         mul(nx, nx, nx, P, Zt, T);
         mul_tn(nx, nx, nx, Zt, T, AP);  // AP is free again; out may be P itself
         mul(nx, nx, nx, W_, Gt, T);
         mul_tn<Op::add>(nx, nx, nx, Gt, T, AP);
         for (int i = 0; i < nx; i++) copy(nx, AP + i * nx, out + i * nx);
         symmetrise(nx, out);
+        if (determined(nx, out, var)) {
+            mul_tn(nx, nx, nx, Gt, T, AP);
+            symmetrise(nx, AP);
+            clear(nx, AP, var, out);
+        }
     }
     // x <- x + G (xs - xp), in place
     inline void mean(const double* xs, double* x) {

@@ -180,8 +180,8 @@ void nonlinear_scan(N n, L lanes, NonlinearArgs& a, const Buffers& b) {
     const double* P = a.P0;
 
     for (long t = 0; t < a.T; ++t) {
-        const double* Q = a.Q + (a.Q_index ? a.Q_index[t] : t * a.Q_step) * nn;
-        const double* R = a.R + (a.R_index ? a.R_index[t] : t * a.R_step) * (size_t)(m * m);
+        const double* Q = a.Q.at(t);
+        const double* R = a.R.at(t);
         bool repaired = false, contradicted = false;
 
         // Prediction: xp, Pp and its factor.

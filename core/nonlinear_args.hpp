@@ -2,7 +2,7 @@
 #pragma once
 #include <cstdint>
 
-#include "isa.hpp"
+#include "kalman.hpp"
 #include "tape_code.hpp"
 
 namespace hw {
@@ -12,9 +12,7 @@ struct NonlinearArgs {
     int nx, ny;  // sizes
     Tape g, h;   // x[t] = g(x[t-1], gu[t]) + w[t], y[t] = h(x[t], hu[t]) + e[t]; inputs of a tape: x, then its row
     const double *gu, *hu;      // (T, g.n_in - nx), (T, h.n_in - nx)
-    const double *Q, *R;        // (K, nx, nx) and (K, ny, ny): one for all rows, one for each, or chosen by index
-    const int32_t *Q_index, *R_index;  // (T,) or null
-    int Q_step, R_step;         // 1 if there is one for each row, else 0
+    Stack Q, R;                 // (nx, nx) and (ny, ny)
     const double *x0, *P0;      // (nx,), (nx, nx): one step before row 0
     const double* y;            // (T, ny)
     const uint8_t* seen;        // (T, ny)

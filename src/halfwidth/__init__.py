@@ -8,6 +8,8 @@ the user. NaN in y is a missing entry.
 """
 
 import importlib
+import sys
+import types
 from typing import TYPE_CHECKING, Any
 
 from halfwidth.methods import ESTIMATORS
@@ -29,9 +31,15 @@ _HOME: dict[str, str] = {
     "Record": "record",
     "Estimate": "result",
     "Status": "result",
+    "from_continuous": "continuous",
     "estimate": "estimate",
     "simulate": "simulate",
     "score": "score",
+    "stream": "stream",
+    "resume": "stream",
+    "forecast": "forecast",
+    "learn": "learn",
+    "Learned": "learn",
     "HalfwidthError": "errors",
     "BadShape": "errors",
     "BadValue": "errors",
@@ -48,6 +56,7 @@ _HOME: dict[str, str] = {
 __all__ = ["__version__", *sorted(_HOME)]
 
 if TYPE_CHECKING:
+    from halfwidth.continuous import from_continuous as from_continuous
     from halfwidth.errors import BadLog as BadLog
     from halfwidth.errors import BadRecord as BadRecord
     from halfwidth.errors import BadShape as BadShape
@@ -58,8 +67,13 @@ if TYPE_CHECKING:
     from halfwidth.errors import Refused as Refused
     from halfwidth.errors import Unsolved as Unsolved
     from halfwidth.estimate import estimate as estimate
+    from halfwidth.forecast import forecast as forecast
+    from halfwidth.learn import Learned as Learned
+    from halfwidth.learn import learn as learn
     from halfwidth.loss import Bernoulli as Bernoulli
     from halfwidth.loss import Markov as Markov
+    from halfwidth.methods._protocol import Estimator as Estimator
+    from halfwidth.methods._protocol import Recursive as Recursive
     from halfwidth.methods.loss import BKF1 as BKF1
     from halfwidth.methods.loss import BKF2 as BKF2
     from halfwidth.methods.loss import GPB as GPB
@@ -67,8 +81,9 @@ if TYPE_CHECKING:
     from halfwidth.methods.loss import BeamSearch as BeamSearch
     from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
     from halfwidth.methods.loss import Runnalls as Runnalls
-    from halfwidth.methods._protocol import Estimator as Estimator
-    from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
+    from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
+    from halfwidth.methods.particle import ParticleFilter as ParticleFilter
     from halfwidth.model import Linear as Linear
     from halfwidth.model import Nonlinear as Nonlinear
     from halfwidth.noise import Gaussian as Gaussian
@@ -82,6 +97,8 @@ if TYPE_CHECKING:
     from halfwidth.spread import Box as Box
     from halfwidth.spread import Cloud as Cloud
     from halfwidth.spread import Normal as Normal
+    from halfwidth.stream import resume as resume
+    from halfwidth.stream import stream as stream
 
 
 def __getattr__(name: str) -> Any:
@@ -94,3 +111,15 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return list(__all__)
+
+
+class _Package(types.ModuleType):
+    """The package: a public function keeps its name although the module that holds it is called the same."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # The import system binds every submodule it loads to the package; `halfwidth.learn` must stay the function.
+        if not (name in _HOME and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -18,7 +18,8 @@ def real(value: ArrayLike | None, name: str, *, error: Kind = BadValue, missing:
     None, masked entries and NaN are missing. Complex numbers, text and ragged lists are refused by name.
     """
     if isinstance(value, np.ma.MaskedArray):
-        value = np.where(np.ma.getmaskarray(value), None, np.ma.getdata(value).astype(object))
+        mask, value = np.ma.getmaskarray(value), np.ma.getdata(value).astype(object)
+        value[mask] = None
     try:
         given = np.asarray(value)
     except ValueError:

@@ -329,7 +329,7 @@ class Nonlinear:
         if given is not None and given.shape != (self.nu,):
             raise BadShape(f"`u` has shape {given.shape}, ({self.nu},) was expected from the model")
         rest: tuple[Any, ...] = (given, self.dt if dt is None else float(dt))
-        rows = []
+        rows: list[Array] = []
         for name, size, angles in (("g", self.nx, self.x_angles), ("h", self.ny, self.y_angles)):
             f = getattr(self, name)
             more = rest[: arity(f, 3 if name == "g" else 1) - 1]

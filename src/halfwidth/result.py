@@ -203,8 +203,9 @@ class Newest(Estimate):
 
     @property
     def status(self) -> Status:
-        """Whether the push went well."""
-        return Status.OK if self._belief.code == 0 else Status.REDUCED
+        """Whether the push went well: code 2 contradicts a certainty, 3 left the range of floating point."""
+        code = self._belief.code
+        return Status.OK if code < 2 else Status.REDUCED if code == 2 else Status.COLLAPSED
 
     @property
     def loglik(self) -> float | None:

@@ -86,11 +86,13 @@ class Tape:
         return value, slope
 
     def agrees(self, f: Callable[..., Any], points: Iterable[tuple[Any, ...]]) -> bool:
-        """Whether the tape and the function give the same at every point where the function is finite.
+        """Return whether the tape and the function give the same at every point where the function is finite.
 
-        Rounding is allowed for (a few hundred units in the last place of the largest entry); one finite point at
-        least is needed to say yes.
+        Each entry may differ by what rounding of the arguments makes of it, 1e-12 relative; one finite point at least
+        is needed to say yes.
         """
+        from halfwidth._core import tape_jacobian
+
         tested = False
         for arguments in points:
             with np.errstate(all="ignore"):
@@ -98,12 +100,14 @@ class Tape:
                 if expected.dtype.kind not in "biuf" or expected.size != len(self.out):
                     return False
                 expected = expected.astype(np.float64).ravel()
-                got = self(*arguments)[0]
-            if not np.isfinite(expected).all():
-                continue
-            scale = np.abs(expected).max(initial=0.0) + np.finfo(np.float64).tiny
-            if not np.abs(got - expected).max() <= 1e-13 * 256 * scale:
-                return False
+                if not np.isfinite(expected).all():
+                    continue
+                point = self._points(arguments)
+                slope = tape_jacobian(self.code, self.constant, self.out, point, point.shape[1])[1][0]
+                felt = np.abs(slope) @ np.abs(point[0])
+                size = np.abs(expected) + np.where(np.isfinite(felt), felt, 0.0)
+                if not np.all(np.abs(self(*arguments)[0] - expected) <= 1e-12 * size + 1e-300):
+                    return False
             tested = True
         return tested
 
@@ -168,7 +172,9 @@ def compiled(f: Callable[..., Any], sizes: Sequence[int | None], points: Iterabl
     """
     tape = trace(f, sizes)
     if not tape.agrees(f, points):
-        raise Untraceable("what was recorded gives other values than the function itself; is it random, or does it count?")
+        raise Untraceable(
+            "what was recorded gives other values than the function itself; is it random, or does it count?"
+        )
     return tape
 
 
@@ -193,10 +199,10 @@ _NAMES = {
     "asinh": "arcsinh", "atan": "arctan", "atan2": "arctan2", "atanh": "arctanh", "pow": "power",
     "true_divide": "divide", "mod": "remainder", "fmax": "maximum", "fmin": "minimum",
 }  # fmt: skip
-_TWO = frozenset(
-    "add subtract multiply divide power arctan2 hypot maximum minimum remainder fmod floor_divide "
-    "less less_equal equal not_equal".split()
-)
+_TWO = {
+    "add", "subtract", "multiply", "divide", "power", "arctan2", "hypot", "maximum", "minimum", "remainder", "fmod",
+    "floor_divide", "less", "less_equal", "equal", "not_equal",
+}  # fmt: skip
 _COMMUTING = frozenset({"add", "multiply", "hypot", "equal", "not_equal"})
 _SPLIT: dict[str, Callable[..., Any]] = {
     "positive": lambda a: a,
@@ -251,7 +257,7 @@ class _Recorder:
         raise Untraceable(f"it computes with a {type(a).__name__}")
 
     def value(self, slot: int) -> float | None:
-        """Number in a slot if it is a constant."""
+        """Return the number in a slot if it is a constant."""
         name, _, value = self.steps[slot]
         return value if name == "constant" else None
 
@@ -267,9 +273,7 @@ class _Recorder:
             arguments = tuple(sorted(arguments))
         return self.step(name, *arguments)
 
-    def _simpler(
-        self, name: str, arguments: tuple[int, ...], numbers: list[float | None]
-    ) -> "_Variable | None":
+    def _simpler(self, name: str, arguments: tuple[int, ...], numbers: list[float | None]) -> "_Variable | None":
         """Neutral and zero factors, and small powers: what products with sparse matrices leave behind."""
 
         def here(slot: int) -> _Variable:
@@ -432,22 +436,22 @@ def _function(f: Callable[..., Any], args: Sequence[Any], kwargs: dict[str, Any]
     return _ours(f(*plain, **{k: _plain(a) for k, a in kwargs.items()}))
 
 
-class _Array(np.ndarray):  # type: ignore[type-arg]
+class _Array(np.ndarray):
     """An object array whose comparisons and choices are recorded, not decided."""
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         return _ufunc(ufunc, method, inputs, kwargs)
 
-    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:  # noqa: ARG002
+    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         return _function(func, args, kwargs)
 
-    def max(self, axis: Any = None, **kwargs: Any) -> Any:  # noqa: A003
+    def max(self, axis: Any = None, **kwargs: Any) -> Any:  # type: ignore[override]
         return _ufunc(np.maximum, "reduce", (self,), {"axis": axis, **kwargs})
 
-    def min(self, axis: Any = None, **kwargs: Any) -> Any:  # noqa: A003
+    def min(self, axis: Any = None, **kwargs: Any) -> Any:  # type: ignore[override]
         return _ufunc(np.minimum, "reduce", (self,), {"axis": axis, **kwargs})
 
-    def clip(self, a_min: Any = None, a_max: Any = None, **kwargs: Any) -> Any:
+    def clip(self, a_min: Any = None, a_max: Any = None, **kwargs: Any) -> Any:  # type: ignore[override]
         return _clip(self, a_min, a_max, **kwargs)
 
 
@@ -465,7 +469,7 @@ class _Variable:
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         return _ufunc(ufunc, method, inputs, kwargs)
 
-    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:  # noqa: ARG002
+    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         return _function(func, args, kwargs)
 
     def __repr__(self) -> str:
@@ -489,7 +493,7 @@ class _Variable:
 
     def __invert__(self) -> Any:
         self._logical()
-        return self == 0
+        return self.record.apply("equal", self, 0.0)
 
     def _logical(self, other: Any = True) -> None:
         # `&`, `|` and `~` of numbers are bit operations, which a tape has not.
@@ -530,7 +534,7 @@ class _Variable:
         return self
 
     @property
-    def T(self) -> "_Variable":  # noqa: N802
+    def T(self) -> "_Variable":
         return self
 
 
@@ -570,16 +574,18 @@ for _symbol, _name in {
     setattr(_Variable, f"__r{_symbol}__", _operator(_name, swapped=True))
 for _symbol, _name in {"lt": "less", "le": "less_equal", "eq": "equal", "ne": "not_equal"}.items():
     setattr(_Variable, f"__{_symbol}__", _operator(_name))
-_Variable.__gt__ = _operator("less", swapped=True)  # type: ignore[attr-defined]
-_Variable.__ge__ = _operator("less_equal", swapped=True)  # type: ignore[attr-defined]
+for _symbol, _name in {"gt": "less", "ge": "less_equal"}.items():
+    setattr(_Variable, f"__{_symbol}__", _operator(_name, swapped=True))
 for _symbol, _name in {"neg": "negative", "abs": "absolute", "pos": "positive", "floor": "floor", "ceil": "ceil",
                        "trunc": "trunc"}.items():  # fmt: skip
     setattr(_Variable, f"__{_symbol}__", _unary(_name))
 # NumPy's object loops call methods of the entries by the name of the function.
-for _name in (
-    "sqrt cbrt square reciprocal sign exp exp2 expm1 log log2 log10 log1p sin cos tan arcsin arccos arctan sinh cosh "
-    "tanh arcsinh arccosh arctanh rint deg2rad rad2deg radians degrees conjugate"
-).split():
+_METHODS = (
+    "sqrt", "cbrt", "square", "reciprocal", "sign", "exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "sin",
+    "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh", "rint",
+    "deg2rad", "rad2deg", "radians", "degrees", "conjugate",
+)  # fmt: skip
+for _name in _METHODS:
     setattr(_Variable, _name, _unary(_name))
 for _name in ("arctan2", "hypot", "fmod"):
     setattr(_Variable, _name, _operator(_name))

@@ -1,8 +1,8 @@
 """The Kalman kernels against their naive twins: random models, masks, degenerate sizes, singular matrices."""
 
-import naive
 import numpy as np
 import pytest
+from tests import naive
 
 from halfwidth import _core
 
@@ -152,7 +152,7 @@ def test_an_index_picks_from_a_stack():
 def test_many_series_equal_one_by_one(threads):
     rng = np.random.default_rng(0)
     args, more = case(11, T=100, nx=4, ny=2, varying=False)
-    A, B, C, Q, R, y, seen, x0, P0 = args
+    A, B, C, Q, R, y, seen, *_ = args
     cut = np.array([0, 7, 7, 40, 99, 100])
     x0s, P0s = rng.normal(size=(5, 4)), np.array([spd(rng, 4) for _ in range(5)])
     many = (A, B, C, Q, R, y, seen, x0s, P0s)
@@ -212,7 +212,9 @@ def test_singular_systems_never_give_nan(isa, what, scale):
                 assert np.isfinite(value).all(), name
             assert got["code"][0] < 3
             low = np.linalg.eigvalsh(got["P"] / k**2)
-            assert (low[:, 0] >= -1e-12 * np.maximum(low[:, -1], 1.0)).all()
+            # a state known exactly leaves only rounding, which exact outputs then contradict
+            tol = 1e-6 if what == "Q, R" else 1e-12
+            assert (low[:, 0] >= -tol * np.maximum(low[:, -1], 1.0)).all()
 
 
 def test_an_exact_output_is_obeyed_and_its_contradiction_told(isa):
@@ -248,7 +250,7 @@ def test_one_row():
 
 def test_no_outputs_at_all():
     args, more = case(5, T=4, nx=3, ny=2, varying=False)
-    A, B, C, Q, R, y, seen, x0, P0 = args
+    A, B, C, Q, R, _, seen, x0, P0 = args
     none = np.zeros((4, 0))
     more.pop("d", None)
     got = _core.kalman_run(

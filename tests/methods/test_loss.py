@@ -424,9 +424,9 @@ def test_stream_equals_record(method, loss):
     stream = LossStream(method, model, seed=5)
     for k in range(40):
         if k == 20:
-            state = stream.state()
+            saved = stream.snapshot()
             stream = LossStream(method, model, seed=77)
-            stream.restore(state)
+            stream.restore(saved)
         now = stream.push(record.y[k], record.u[k])
         np.testing.assert_allclose(now.x[0], whole.x[k], rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(now.P[0], whole.P[k], rtol=1e-10, atol=1e-10)
@@ -443,6 +443,25 @@ def test_stream_of_a_nonlinear_model():
     for k in range(50):
         now = stream.push(record.y[k], record.u[k])
         np.testing.assert_allclose(now.x[0], whole.x[k], rtol=1e-8, atol=1e-8)
+
+
+def test_the_public_stream():
+    model, _, record = car(T=30)
+    model = with_loss(model, hw.Markov(0.9, 0.8))
+    live = hw.stream(model)
+    for k in range(30):
+        now = live.push(record.y[k], record.u[k])
+        if k == 10:
+            live = hw.resume(live.snapshot(), model)
+    whole = hw.estimate(model, record, hw.GPB())
+    np.testing.assert_allclose(now.x[0], whole.x[-1], rtol=1e-10)
+    assert now.status is hw.Status.OK
+    assert live.rows == 30
+    missing = live.push(None, record.u[0])
+    assert float(missing.gamma[0]) == 0.0
+    for y, u, dt in (([np.inf, 0.0], [0.0], None), ([1.0], [0.0], None), ([1.0, 2.0], None, None), ([1.0, 2.0], [0.0], 0.0)):
+        with pytest.raises(hw.BadRecord):
+            live.push(y, u, dt)
 
 
 # ---- the border

@@ -5,6 +5,8 @@ from typing import Any
 
 #: Exported estimators and the module of each; loaded when first used.
 ESTIMATORS: dict[str, str] = {
+    "KalmanFilter": "kalman",
+    "KalmanSmoother": "kalman",
     "ExtendedKalman": "nonlinear",
     "UnscentedKalman": "nonlinear",
     "ParticleFilter": "particle",

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from halfwidth import _core
 from halfwidth.array import Array
 from halfwidth.derivative import differences
-from halfwidth.errors import BadShape, BadValue, Refused
+from halfwidth.errors import BadRecord, BadValue, HalfwidthError, Refused
 from halfwidth.loss import Bernoulli, Loss, Markov, Modes, revised
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear, arity
@@ -178,15 +178,15 @@ class _LossMethod:
                 rows = _about(model, record, rows, out["x"])
         return self._estimate(model, record, loss, out, {"seed": number} | learned)
 
-    def stream(self, model: Model, *, seed: int | None = None) -> "LossStream":
-        """Return the method as an object that takes one row at a time.
+    def stream(self, model: Model, t: float = 0.0) -> "LossStream":
+        """Return the online form, which `halfwidth.stream` wraps; methods that draw use the seed 0.
 
         Raises
         ------
         Refused
             If the method smooths or the model varies in another way than with the step.
         """
-        return LossStream(self, model, seed=seed)
+        return LossStream(self, model, t=t)
 
     def _kernel(self, rows: _Rows, loss: Loss | None, model: Model, record: Record, seed: int) -> dict[str, Any]:
         y, modes = _modes(rows, loss, record)
@@ -594,18 +594,23 @@ def _now(loss: Any, law: Array) -> Any:
 class _Belief:
     """What one push found, in the form that `halfwidth.result.Newest` reads."""
 
-    __slots__ = ("P", "_stream", "code", "loglik", "modes", "rows", "seen", "t", "x")
+    __slots__ = ("P", "_loss", "_modes", "_y", "code", "loglik", "rows", "t", "x")
 
     def __init__(self, stream: "LossStream", found: Any, y: Array) -> None:
-        self.x, self.P, self.modes, _, self.code, _ = found
-        self._stream = stream
-        self.rows, self.t, self.loglik, self.seen = stream.rows, stream.t, stream.loglik, y == y
+        self.x, self.P, self._modes, _, code, _ = found
+        self.code = _CODES[code]
+        self.rows, self.t, self.loglik = stream.pushed, stream.t, stream.loglik
+        self._loss, self._y = stream.model.loss, y
 
     @property
     def gamma(self) -> Array | None:
         """Probability that y was received."""
-        gamma = received(self._stream.model.loss, self.modes[None], self.seen[None])[0]
+        gamma = received(self._loss, self._modes[None], ~np.isnan(self._y)[None])[0]
         return None if gamma is None else gamma[0]
+
+
+#: Codes of a pushed row: 2 the row was left unused, 3 the numbers left the range of floating point.
+_CODES = (0, 2, 2, 3)
 
 
 class LossStream:
@@ -615,10 +620,12 @@ class LossStream:
     ----------
     method : BKF1, BKF2, GPB, RBPF, FearnheadClifford, Runnalls or BeamSearch
     model : Linear or Nonlinear
+    t : float
+        Time of the prior, s.
     seed : int, optional
     """
 
-    def __init__(self, method: _LossMethod, model: Model, *, seed: int | None = None) -> None:
+    def __init__(self, method: _LossMethod, model: Model, *, t: float = 0.0, seed: int | None = None) -> None:
         reason = method.refuses(model)
         if reason is None and method._smoothing:
             reason = f"`{typed(method)}` smooths, a stream filters\nhint: {type(method).__name__}()"
@@ -633,15 +640,18 @@ class LossStream:
             raise Refused(message, hint=hint or None)
         self.method, self.model = method, model
         self._seed = 0 if seed is None else int(seed)
-        self.rows, self.loglik = 0, 0.0
-        self.t = 0.0
+        self.pushed, self.loglik, self.t = 0, 0.0, float(t)
+        self._kind = type("NewestLoss", (Newest,), {"__slots__": (), "method": typed(method), "names": model.names.x})
         self._u = isinstance(model, Linear) and model.B is not None
         self._fixed = isinstance(model, Linear) and all(m.constant for m in (*_matrices(model), model.w.cov(), model.e.cov()))
         self._stale = loss is not None and "stale" in loss.kind
+        self._quick = self._fixed and not self._stale
+        self._none = np.full(model.ny, np.nan)
+        self._shape = (model.ny,)
         self._last = np.full(model.ny, np.nan)
         self._x = np.array(model.x0.mean)
         self._P = np.array(model.x0.P)  # type: ignore[union-attr]
-        self._layout: _Rows | None = None
+        self._B: Array | None = None
         self._modes: Modes | None = None
         self._core: Any = None
 
@@ -665,19 +675,30 @@ class LossStream:
         dt : float, optional
             Step since the row before, s; ``model.dt`` if absent.
         """
-        y = np.ascontiguousarray(y, dtype=np.float64).reshape(-1)
-        if len(y) != self.model.ny:
-            raise BadShape(f"`y` has {len(y)} entries, {self.model.ny} were expected")
-        step = self.model.dt if dt is None else float(dt)
-        if self._modes is not None and not self._stale and self._fixed:
-            b = None if not self._u else self._input(u)
-            found = self._core.push(y, b, self._offset, self.rows > 0 or self.method.prior == "filtered")
-            self._moved(found, step)
-        else:
-            given = None if u is None else np.asarray(u, dtype=np.float64).reshape(-1)
-            found = self._push_rows(self._prepare(given, step, y), y, step)
-        newest: Newest = object.__new__(Newest)
-        object.__setattr__(newest, "_belief", _Belief(self, found, y))
+        row = self._none if y is None else np.array(y, dtype=np.float64, ndmin=1)
+        if row.shape != self._shape:
+            raise BadRecord(f"`y` is {y!r}, {self.model.ny} numbers were expected; None or NaN is missing")
+        step = self.model.dt
+        if dt is not None:
+            step = float(dt)
+            if not 0.0 < step < np.inf:
+                raise BadRecord(f"`dt` is {dt!r}, a positive number of seconds was expected")
+        try:
+            if self._quick and self._modes is not None:
+                b = self._input(u) if self._u else None
+                found = self._core.push(row, b, self._offset, self.pushed > 0 or self.method.prior == "filtered")
+                self._moved(found, step)
+            else:
+                given = None if u is None else np.array(u, dtype=np.float64, ndmin=1)
+                if (0 if given is None else given.size) != self.model.nu:
+                    raise BadRecord(f"`u` is {u!r}, {self.model.nu} finite numbers were expected")
+                found = self._push_rows(self._prepare(given, step, row), row, step)
+        except ValueError as exc:
+            if isinstance(exc, HalfwidthError):
+                raise
+            raise BadRecord(f"`y` is {y!r} and `u` is {u!r}: {exc}") from None
+        newest: Newest = object.__new__(self._kind)
+        object.__setattr__(newest, "_belief", _Belief(self, found, row))
         return newest
 
     def linear_row(self, y: Array, u: Array | None, dt: float) -> tuple[Array, ...]:
@@ -686,36 +707,33 @@ class LossStream:
         self._push_rows(rows, y, dt)
         return rows.A[0], rows.b[0], rows.Q[0], rows.C[0], rows.R[0], rows.d[0]  # type: ignore[index]
 
-    def state(self) -> bytes:
+    def snapshot(self) -> bytes:
         """Return everything a later process needs to go on."""
-        head = np.concatenate([[self.rows, self.t, self.loglik], self._last, self._x, self._P.ravel()])
+        head = np.concatenate([[self.pushed, self.t, self.loglik], self._last, self._x, self._P.ravel()])
         return head.tobytes() + self._core.state()
 
-    def restore(self, state: bytes) -> None:
+    def restore(self, saved: bytes) -> None:
         """Go on from a state of the same model and method.
 
         Raises
         ------
-        BadValue
-            If the state belongs to another.
+        ValueError
+            If it belongs to another.
         """
         n, ny = self.model.nx, self.model.ny
         size = 8 * (3 + ny + n + n * n)
-        head = np.frombuffer(state[:size])
-        if len(state) <= size:
-            raise BadValue(f"the state has {len(state)} bytes, more than {size} were expected")
+        if len(saved) <= size:
+            raise ValueError(f"it has {len(saved)} bytes, more than {size} were expected")
+        head = np.frombuffer(saved[:size])
         if self._modes is None:
             self._set(self._prepare(None, self.model.dt), np.zeros(ny))
-        try:
-            self._core.restore(state[size:])
-        except ValueError as exc:
-            raise BadValue(str(exc)) from None
-        self.rows, self.t, self.loglik = int(head[0]), float(head[1]), float(head[2])
+        self._core.restore(saved[size:])
+        self.pushed, self.t, self.loglik = int(head[0]), float(head[1]), float(head[2])
         self._last, self._x = head[3 : 3 + ny].copy(), head[3 + ny : 3 + ny + n].copy()
         self._P = head[3 + ny + n :].reshape(n, n).copy()
 
     def _moved(self, found: Any, dt: float) -> None:
-        self.rows += 1
+        self.pushed += 1
         self.t += dt
         self.loglik += found[3]
         self._x, self._P = found[0], found[1]
@@ -723,7 +741,7 @@ class LossStream:
     def _push_rows(self, rows: _Rows, y: Array, dt: float) -> Any:
         modes = self._set(rows, y)
         found = self._core.push(y, None if rows.b is None else rows.b[0], None if modes.d is None else modes.d[0],
-                                self.rows > 0 or self.method.prior == "filtered")  # fmt: skip
+                                self.pushed > 0 or self.method.prior == "filtered")  # fmt: skip
         self._last = np.where(np.isnan(y), self._last, y)
         self._moved(found, dt)
         return found
@@ -746,11 +764,10 @@ class LossStream:
         return found._replace(d=None if found.d is None else found.d[-1:])
 
     def _input(self, u: Any) -> Array:
-        if u is None:
-            raise BadValue(f"`u` is absent but the model has {self.model.nu} inputs", hint="push(y, u)")
-        layout = self._layout
-        assert layout is not None
-        return np.ascontiguousarray(self._B @ np.asarray(u, dtype=np.float64).reshape(-1))
+        given = np.array([] if u is None else u, dtype=np.float64, ndmin=1)
+        if given.shape != (self.model.nu,) or not np.isfinite(given).all():
+            raise BadRecord(f"`u` is {u!r}, {self.model.nu} finite numbers were expected", hint="push(y, u)")
+        return np.ascontiguousarray(self._B @ given)
 
     def _prepare(self, u: Array | None, dt: float, y: Array | None = None) -> _Rows:
         """Return the linear model of one row; a `Nonlinear` one is linearised about the mixture's mean."""
@@ -760,15 +777,13 @@ class LossStream:
             at = np.array([self.t + dt])
             record = Record(at, np.zeros((1, model.ny)), inputs if model.B is not None else None)
             rows = linear_rows(dataclasses.replace(model, dt=dt), record)
-            if self._u:
-                unit = [linear_rows(dataclasses.replace(model, dt=dt), Record(at, np.zeros((1, model.ny)), e[None])).b
-                        for e in np.eye(model.nu)] if self._layout is None else None  # fmt: skip
-                if unit is not None:
-                    self._B = np.stack([v[0] for v in unit if v is not None], axis=1)
-            self._layout = rows
+            if self._u and self._B is None:
+                unit = Record(np.arange(model.nu) + at, np.zeros((model.nu, model.ny)), np.eye(model.nu))
+                if self._fixed:
+                    self._B = np.ascontiguousarray(linear_rows(model, unit).b.T)  # type: ignore[union-attr]
             return rows
         u = np.zeros(model.nu) if u is None else u
-        moves = self.rows > 0 or self.method.prior == "filtered"
+        moves = self.pushed > 0 or self.method.prior == "filtered"
         return _tangent(model, self._x if moves else None, self._x, np.sqrt(np.diagonal(self._P)), u, dt, self.t + dt, y)
 
 

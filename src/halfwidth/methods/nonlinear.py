@@ -1,9 +1,11 @@
 """Extended and unscented Kalman filter and smoother for nonlinear models with Gaussian noise.
 
-``x[t] = g(x[t-1], u[t]) + w[t]``,  ``y[t] = h(x[t]) + e[t]``. The extended filter linearises g and h at the estimate [1]_;
-the unscented filter carries sigma points through them [2]_. With ``smooth=True`` a Rauch-Tung-Striebel pass uses the
-whole record. ``g`` and ``h`` are recorded once a run and then run compiled, the whole record in C++; where that is not
-possible the same algorithm runs in NumPy. ``info["evaluated"]`` says which, ``info["reason"]`` why.
+``x[t] = g(x[t-1], u[t]) + w[t]``, ``y[t] = h(x[t]) + e[t]``. The extended filter linearises g and h at the estimate
+[1]_; the unscented filter carries sigma points through them [2]_. With ``smooth=True`` a Rauch-Tung-Striebel pass
+uses the whole record. ``g`` and ``h`` are recorded once a run and then run compiled, the whole record in C++; where
+that is not possible the same algorithm runs in NumPy. ``info["evaluated"]`` says which, ``info["reason"]`` why;
+``info["nis"]`` is the normalised square of each row's innovation, ``info["x0"]`` and ``info["P0"]`` the smoothed
+state one step before the first row.
 
 References
 ----------
@@ -21,7 +23,7 @@ import numpy as np
 from halfwidth import methods
 from halfwidth.array import Array
 from halfwidth.derivative import differences
-from halfwidth.errors import BadShape, BadValue
+from halfwidth.errors import BadShape, BadValue, Refused, hinted
 from halfwidth.methods._deviations import Function, Spread, scan
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear, arity
@@ -186,7 +188,7 @@ class _Rows(NamedTuple):
         return tuple(None if a is None else float(a[k]) if a.ndim == 1 else a[k] for a in self.more)
 
     def columns(self) -> Array:
-        """The same as one matrix (T, number of inputs)."""
+        """Return the same as one matrix (T, number of inputs)."""
         blocks = [a.reshape(len(self.t), -1) for a in self.more if a is not None]
         return np.ascontiguousarray(np.concatenate(blocks, axis=1)) if blocks else np.empty((len(self.t), 0))
 
@@ -205,7 +207,7 @@ def _refuses(method: Method, model: Model) -> str | None:
     if model.bounds is not None:
         return f"`{name}` cannot keep `bounds`\nhint: model.as_gaussian() drops them, ParticleFilter() keeps them"
     if model.loss is not None:
-        return f"`{name}` cannot tell losses from outputs\nhint: ParticleFilter() on a model without `loss`, NaN where lost"
+        return f"`{name}` cannot tell losses from outputs\nhint: a model without `loss`, and NaN where y was lost"
     return None
 
 
@@ -235,7 +237,7 @@ def _run(method: Method, model: Model, record: Record, spread: Spread, iteration
     info: dict[str, Any] = {"evaluated": "python" if tapes is None else "compiled", "iterations": rounds}
     info |= {"nis": found["nis"], "message": message, "reason": reason}
     if method.smooth:
-        info["x0"] = Normal.of(found["x0"], found["P0"])
+        info |= {"x0": found["x0"], "P0": found["P0"]}
     return Estimate(
         record.t,
         found["x"],
@@ -430,15 +432,14 @@ def _judged(found: dict[str, Any], t: Array) -> tuple[Status, str | None]:
 
 
 def _init(method: Method, model: Model) -> Belief:
-    if isinstance(model, Linear):
-        raise BadValue(
-            f"`{type(method).__name__}` was asked to stream a linear model", hint="stream(model, KalmanFilter())"
-        )
     reason = method.refuses(model)
     if reason is not None:
-        raise BadValue(reason)
+        message, hint = hinted(reason)
+        raise Refused(message, hint=hint)
     prior = model.x0
     assert isinstance(prior, Normal)
+    if isinstance(model, Linear):
+        return Belief(prior.mean, prior.P, 0.0, None, None)
     u = np.zeros((1, model.nu)) if model.nu else None
     rows = _rows(model, np.zeros(1), np.full(1, model.dt), np.full((1, model.ny), np.nan), u)
     tapes, _ = _tapes(model, rows, exact=isinstance(method, ExtendedKalman), wanted=method.compiled)
@@ -448,10 +449,26 @@ def _init(method: Method, model: Model) -> Belief:
 def _step(
     model: Model, state: Belief, y: Array, u: Array | None, t: float, dt: float, spread: Spread, iterations: int
 ) -> Belief:
-    assert isinstance(model, Nonlinear)
     outputs = np.asarray(y, dtype=np.float64).reshape(1, model.ny)
     inputs = None if u is None else np.asarray(u, dtype=np.float64).reshape(1, model.nu)
-    rows = _rows(model, np.array([t]), np.array([dt]), outputs, inputs)
-    tapes = None if state.g is None or state.h is None else (state.g, state.h)
-    found = _pass(model, rows, tapes, state.x, state.P, spread, iterations, None, smooth=False)
+    if isinstance(model, Linear):
+        found = _linear_row(model, state, outputs, inputs, t, dt)
+    else:
+        rows = _rows(model, np.array([t]), np.array([dt]), outputs, inputs)
+        tapes = None if state.g is None or state.h is None else (state.g, state.h)
+        found = _pass(model, rows, tapes, state.x, state.P, spread, iterations, None, smooth=False)
     return Belief(found["x"][0], found["P"][0], state.loglik + float(found["loglik"][0]), state.g, state.h)
+
+
+def _linear_row(model: Linear, state: Belief, y: Array, u: Array | None, t: float, dt: float) -> dict[str, Any]:
+    """One row of a linear model, E and F folded into the other matrices."""
+    at = {name: matrix.at(t, dt) for name, matrix in model.matrices.items()}
+    E = np.linalg.inv(at["E"]) if "E" in at else np.eye(model.nx)
+    F = np.linalg.inv(at["F"]) if "F" in at else np.eye(model.ny)
+    A, C = E @ at["A"], F @ at["C"]
+    shift = np.zeros(model.nx) if u is None else E @ at["B"] @ u[0]
+    Q, R = E @ model.w.cov().at(t, dt) @ E.T, F @ model.e.cov().at(t, dt) @ F.T
+    g = Function(lambda x, _: A @ x + shift, lambda *_: A, np.zeros(model.nx, bool))
+    h = Function(lambda x, _: C @ x, lambda *_: C, np.zeros(model.ny, bool))
+    exact = Spread(0.0, 0.0, 0.0)
+    return scan(g, h, lambda _: Q, lambda _: R, state.x, state.P, y, ~np.isnan(y), exact)
