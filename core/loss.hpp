@@ -370,7 +370,7 @@ inline bool weigh(LossState& s, double* loglik) {
         top = max4(top, lw[b]);
     }
     const double g = top4(top);
-    if (!(g > -1e300)) return false;
+    if (!(g > -1e300 && g < 1e300)) return false;
     V4 total{};
     for (int b = 0; b < B; b++) total += exp4(lw[b] - g);
     const double sum = sum4(total), lse = g + std::log(sum);

@@ -85,7 +85,9 @@ class Mix:
                             lp = np.log(self.mix @ np.exp(logPi[:, s]))
                     else:
                         lp = logPi[history[-1], s]
-                    ll, xc, Pc = correct(row(p["C"], t)[s], row(p["d"], t)[s], row(p["R"], t)[s], x, P, p["y"][t], p["seen"][t])
+                    ll, xc, Pc = correct(
+                        row(p["C"], t)[s], row(p["d"], t)[s], row(p["R"], t)[s], x, P, p["y"][t], p["seen"][t]
+                    )
                     children.append((history + (s,), lw + lp + ll, xc, Pc))
             total = logsumexp([c[1] for c in children])
             children = [(h, lw - total, x, P) for h, lw, x, P in children]
@@ -123,7 +125,9 @@ def gpb(p, depth, spread=True):
         if depth == 0:
             M = p["C"].shape[1]
             mode = [c[0][-1] for c in children]
-            mix.mix = np.array([sum(np.exp(c[1]) for c, m in zip(children, mode, strict=True) if m == s) for s in range(M)])
+            mix.mix = np.array(
+                [sum(np.exp(c[1]) for c, m in zip(children, mode, strict=True) if m == s) for s in range(M)]
+            )
         return out
 
     return Mix(p, rule, first=start(p), spread=spread).run()
@@ -257,7 +261,9 @@ def imm(p):
             xj, Pj = mixed[j]
             if t or not p.get("prior_predicted"):
                 xj, Pj = predict(row(p["A"], t), row(p["b"], t), row(p["Q"], t), xj, Pj)
-            ll[j], x[j], P[j] = correct(row(p["C"], t)[j], row(p["d"], t)[j], row(p["R"], t)[j], xj, Pj, p["y"][t], p["seen"][t])
+            ll[j], x[j], P[j] = correct(
+                row(p["C"], t)[j], row(p["d"], t)[j], row(p["R"], t)[j], xj, Pj, p["y"][t], p["seen"][t]
+            )
         a = np.log(c) + ll
         mu = np.exp(a - logsumexp(a))
         X, V = moments(mu, x, P)
@@ -283,7 +289,9 @@ def enumerate_all(p, smooth=False):
                 lp = first[s] if t == 0 else logPi[h[-1], s]
                 if lp == -np.inf:
                     continue
-                ll, xc, Pc = correct(row(p["C"], t)[s], row(p["d"], t)[s], row(p["R"], t)[s], x, P, p["y"][t], p["seen"][t])
+                ll, xc, Pc = correct(
+                    row(p["C"], t)[s], row(p["d"], t)[s], row(p["R"], t)[s], x, P, p["y"][t], p["seen"][t]
+                )
                 new.append((h + (s,), lw + lp + ll, xc, Pc, [*past, (xc, Pc)] if smooth else past))
         parts = new
         lw = np.array([c[1] for c in parts])
@@ -314,7 +322,9 @@ def enumerate_all(p, smooth=False):
         xs.append(x)
         Ps.append(P)
         modes.append([w[H[:, t] == s].sum() for s in range(M)])
-    pairs = np.array([[sum(w[(H[:, t - 1] == i) & (H[:, t] == j)].sum() for t in range(1, T)) for j in range(M)] for i in range(M)])
+    pairs = np.array(
+        [[sum(w[(H[:, t - 1] == i) & (H[:, t] == j)].sum() for t in range(1, T)) for j in range(M)] for i in range(M)]
+    )
     return {"x": np.array(xs), "P": np.array(Ps), "modes": np.array(modes), "loglik": loglik, "pairs": pairs}
 
 

@@ -43,7 +43,7 @@ class Modes(NamedTuple):
     R: Array  # (1 or T, M, ny, ny)
     Pi: Array  # (1 or T, M, M)
     pi0: Array  # (M,)
-    count: Array | None  # (G, 2, 2) pseudo-counts of a law to be learned
+    prior: Array | None  # (G, 2, 2) pseudo-counts of a law to be learned
     carries: NDArray[np.bool_]  # (M, ny) whether an output carries the state
 
 
@@ -119,7 +119,9 @@ class _Loss:
         if given.ndim < 2:
             given = np.diag(np.broadcast_to(given, (ny,)))
         if given.shape != (ny, ny):
-            raise BadShape(f"`noise` of the loss has shape {self.noise.shape}, ({ny}, {ny}) was expected from the model")
+            raise BadShape(
+                f"`noise` of the loss has shape {self.noise.shape}, ({ny}, {ny}) was expected from the model"
+            )
         return np.broadcast_to(given, R.shape)
 
     def modes(self, C: Array, R: Array, y: Array, seen: NDArray[np.bool_]) -> Modes:
@@ -209,8 +211,8 @@ class _Loss:
         S, G = between.shape[-1], len(groups)
         v = e
         if isinstance(model, Linear) and model.F is not None:
-            F = model.F.stack(np.arange(T) * model.dt, np.full(T, model.dt))[0]
-            v = np.linalg.solve(np.broadcast_to(F, (T, ny, ny)), e[..., None])[..., 0]
+            F = model.F.stack(model.dt * np.arange(T, dtype=np.float64), np.full(T, model.dt))[0]
+            v = np.asarray(np.linalg.solve(np.broadcast_to(F, (T, ny, ny)), e[..., None])[..., 0], dtype=np.float64)
         R = np.cov(v.T).reshape(ny, ny) if T > 1 else np.eye(ny)
         draws = {kind: rng.multivariate_normal(np.zeros(ny), self.cov(kind, R), T, method="eigh") for kind in self.kind}
         if self.noise is None and "noise" in draws:
@@ -219,7 +221,11 @@ class _Loss:
         state = np.zeros(G, dtype=int)
         for t in range(T):
             for g, members in enumerate(groups):
-                law = first[0, g % first.shape[1]] if t == 0 else between[t % len(between), g % between.shape[1], state[g]]
+                law = (
+                    first[0, g % first.shape[1]]
+                    if t == 0
+                    else between[t % len(between), g % between.shape[1], state[g]]
+                )
                 state[g] = rng.choice(S, p=law)
                 if state[g] == S - 1:
                     continue
@@ -282,7 +288,9 @@ class Bernoulli(_Loss):
         object.__setattr__(self, "received", _probability(received, "received"))
 
     @classmethod
-    def unknown(cls, received: ArrayLike = 0.5, *, worth: float = 2.0, learn_noise: bool = False, **more: Any) -> "Bernoulli":
+    def unknown(
+        cls, received: ArrayLike = 0.5, *, worth: float = 2.0, learn_noise: bool = False, **more: Any
+    ) -> "Bernoulli":
         """Return losses whose probability is to be learned.
 
         Parameters
@@ -296,7 +304,8 @@ class Bernoulli(_Loss):
         **more
             As for `Bernoulli`.
         """
-        return _unknown(cls(received, **more), worth, learn_noise)
+        found: Bernoulli = _unknown(cls(received, **more), worth, learn_noise)
+        return found
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -380,7 +389,8 @@ class Markov(_Loss):
         **more: Any,
     ) -> "Markov":
         """Return losses whose law is to be learned; the probabilities are prior means. See `Bernoulli.unknown`."""
-        return _unknown(cls(stay_received, stay_lost, **more), worth, learn_noise)
+        found: Markov = _unknown(cls(stay_received, stay_lost, **more), worth, learn_noise)
+        return found
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -439,13 +449,15 @@ def _without(Pi: Array, pi0: Array, unable: NDArray[np.bool_]) -> tuple[Array, A
     able = ~unable
     rest = np.where(able[:, None, :], Pi, 0.0)
     total = rest.sum(axis=-1, keepdims=True)
-    Pi = np.where(total > 0, rest / np.where(total > 0, total, 1.0), able[:, None, :] / able.sum(axis=-1)[:, None, None])
+    Pi = np.where(
+        total > 0, rest / np.where(total > 0, total, 1.0), able[:, None, :] / able.sum(axis=-1)[:, None, None]
+    )
     first = np.where(able[0], pi0, 0.0)
     return Pi, first / first.sum() if first.sum() > 0 else able[0] / able[0].sum()
 
 
 def _together(law: Array, n_sensors: int, T: int) -> Array:
-    """Return the joint law of independent sensors, the first varying fastest: (1 or T, 1 or G, ...) to (1 or T, ...)."""
+    """Return the joint law of independent sensors, the first varying fastest: the axis of sensors goes."""
     if len(law) not in (1, T):
         raise BadShape(f"the loss law is given for {len(law)} rows but the record has {T}")
     parts = [law[:, g % law.shape[1]] for g in range(n_sensors)]
@@ -474,7 +486,9 @@ def _common(
     given = None if noise is None else real(noise, "noise")
     if given is not None:
         if len(kinds) > 1:
-            raise BadValue(f"`noise` is given for {len(kinds)} kinds of loss, one kind was expected", hint="leave it away")
+            raise BadValue(
+                f"`noise` is given for {len(kinds)} kinds of loss, one kind was expected", hint="leave it away"
+            )
         if given.ndim > 2 or (given.ndim == 2 and given.shape[0] != given.shape[1]):
             raise BadShape(f"`noise` has shape {given.shape}, a scalar, (ny,) or (ny, ny) was expected")
         given = covariance(given, "noise") if given.ndim == 2 else given
@@ -505,7 +519,7 @@ def _unknown(loss: Any, worth: float, learn_noise: bool) -> Any:
     if any(np.any((v <= 0) | (v >= 1)) for v in numbers):
         raise BadValue(f"the prior means are {numbers}, numbers between 0 and 1, ends excluded, were expected")
     if learn_noise and loss.kind != ("noise",):
-        raise BadValue(f"`learn_noise` is True for kind {loss.kind[0]!r}, it needs \"noise\"")
+        raise BadValue(f'`learn_noise` is True for kind {loss.kind[0]!r}, it needs "noise"')
     object.__setattr__(loss, "worth", float(worth))
     object.__setattr__(loss, "unknown_noise", bool(learn_noise))
     return loss
@@ -535,7 +549,11 @@ def _probability(value: ArrayLike, name: str) -> Array:
 def _show(loss: _Loss, numbers: list[Array]) -> str:
     parts = [np.array2string(v, precision=4, separator=", ") if v.ndim < 2 else "varying" for v in numbers]
     if loss.kind != ("noise",):
-        parts.append(f"kind={loss.kind[0] if len(loss.kind) == 1 else loss.kind!r}" if len(loss.kind) > 1 else f"kind={loss.kind[0]!r}")
+        parts.append(
+            f"kind={loss.kind[0] if len(loss.kind) == 1 else loss.kind!r}"
+            if len(loss.kind) > 1
+            else f"kind={loss.kind[0]!r}"
+        )
     if loss.noise is not None:
         parts.append("noise=" + np.array2string(loss.noise, precision=4, separator=", ").replace("\n", ""))
     if loss.sensors is not None:

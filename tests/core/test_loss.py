@@ -47,7 +47,21 @@ def problem(seed, n=3, m=2, M=2, T=12, *, varying=False, holes=0.2, certain=Fals
     return {k: np.ascontiguousarray(v) if isinstance(v, np.ndarray) else v for k, v in p.items()}
 
 
-def kernel(p, rule, *, components=1, depth=0, spread=True, smooth=0, lag=0, seed=0, threshold=0.5, learn=0, count=None, groups=1):
+def kernel(
+    p,
+    rule,
+    *,
+    components=1,
+    depth=0,
+    spread=True,
+    smooth=0,
+    lag=0,
+    seed=0,
+    threshold=0.5,
+    learn=0,
+    count=None,
+    groups=1,
+):
     before = {k: v.copy() for k, v in p.items() if isinstance(v, np.ndarray)}
     out = _core.loss_filter(
         p["A"], p["b"], p["Q"], p["C"], p["d"], p["R"], p["Pi"], p["y"], p["seen"], p["x0"], p["P0"], p["pi0"], count,
@@ -152,7 +166,9 @@ def test_hard_decisions_smoothed_are_rauch_tung_striebel():
     out = kernel(p, DECIDE, smooth=1)
     np.testing.assert_array_equal(out["modes"], filtered["modes"])
     known = {**p, "Pi": np.repeat(filtered["modes"][:, None, :], 2, axis=1), "pi0": filtered["modes"][0]}
-    close({k: out[k] for k in ("x", "P", "modes")} | {"loglik": 0}, {k: v for k, v in naive.kim(known, 1).items()}, 1e-10)
+    close(
+        {k: out[k] for k in ("x", "P", "modes")} | {"loglik": 0}, {k: v for k, v in naive.kim(known, 1).items()}, 1e-10
+    )
 
 
 @pytest.mark.parametrize("N", [500, 900])
@@ -205,7 +221,13 @@ def stream(p, rule, *, components=1, depth=0, seed=0, learn=0, count=None):
 
 @pytest.mark.parametrize(
     ("rule", "settings"),
-    [(DECIDE, {}), (AVERAGE, {"depth": 2}), (SAMPLE, {"components": 9}), (RESAMPLE, {"components": 5}), (MERGE, {"components": 4})],
+    [
+        (DECIDE, {}),
+        (AVERAGE, {"depth": 2}),
+        (SAMPLE, {"components": 9}),
+        (RESAMPLE, {"components": 5}),
+        (MERGE, {"components": 4}),
+    ],
 )
 def test_stream_equals_record_and_survives_its_state(rule, settings):
     p = problem(12, n=3, m=2, T=14)

@@ -95,7 +95,12 @@ def test_the_kalman_family_agrees(ours, theirs):
 # ---- A2: exactness
 
 
-LAWS = [hw.Bernoulli(0.7), hw.Markov(0.9, 0.8), hw.Bernoulli(0.6, kind="garbage"), hw.Markov(0.9, 0.7, kind=("noise", "stale"))]
+LAWS = [
+    hw.Bernoulli(0.7),
+    hw.Markov(0.9, 0.8),
+    hw.Bernoulli(0.6, kind="garbage"),
+    hw.Markov(0.9, 0.7, kind=("noise", "stale")),
+]
 
 
 @pytest.mark.parametrize("loss", LAWS, ids=repr)
@@ -135,7 +140,16 @@ def test_distance_to_the_exact_posterior(name):
 
 @pytest.fixture(scope="module")
 def scores():
-    names = ("BKF-I", "BKF-II", "GPB depth 1", "GPB depth 5", "RBPF 50", "RBPF 100", "RBPF 500", "Fearnhead-Clifford 100")
+    names = (
+        "BKF-I",
+        "BKF-II",
+        "GPB depth 1",
+        "GPB depth 5",
+        "RBPF 50",
+        "RBPF 100",
+        "RBPF 500",
+        "Fearnhead-Clifford 100",
+    )
     return {name: paper.accuracy(case, runs=150, depth=8, only=names) for name, case in CASES.items()}
 
 
@@ -197,7 +211,13 @@ def test_expectation_maximisation():
     assert found["drops"].max() < 1e-2
 
 
-ONLINE = [hw.FearnheadClifford(100, **FIRST), hw.RBPF(200, **FIRST), hw.GPB(3, **FIRST), hw.Runnalls(8, **FIRST), hw.BKF2(**FIRST)]
+ONLINE = [
+    hw.FearnheadClifford(100, **FIRST),
+    hw.RBPF(200, **FIRST),
+    hw.GPB(3, **FIRST),
+    hw.Runnalls(8, **FIRST),
+    hw.BKF2(**FIRST),
+]
 
 
 @pytest.mark.parametrize("method", ONLINE, ids=repr)
@@ -270,7 +290,9 @@ def test_sensors_with_correlated_noise_are_judged_jointly():
 
 
 @pytest.mark.parametrize(
-    "loss", [hw.Bernoulli([0.7, 0.8]), hw.Markov([0.9, 0.8], [0.7, 0.6]), hw.Bernoulli([0.7, 0.8], kind="stale")], ids=repr
+    "loss",
+    [hw.Bernoulli([0.7, 0.8]), hw.Markov([0.9, 0.8], [0.7, 0.6]), hw.Bernoulli([0.7, 0.8], kind="stale")],
+    ids=repr,
 )
 def test_sensors_equal_the_enumeration(loss):
     model, _, record = car(T=4, R=np.array([[1.0, 0.4], [0.4, 2.0]]))
@@ -356,7 +378,9 @@ def test_center_of_pure_noise():
 
 def turning(loss):
     def g(x, u, dt):
-        return np.array([x[0] + dt * x[2] * np.cos(x[3]), x[1] + dt * x[2] * np.sin(x[3]), x[2] + dt * u[0], x[3] + dt * u[1]])
+        return np.array(
+            [x[0] + dt * x[2] * np.cos(x[3]), x[1] + dt * x[2] * np.sin(x[3]), x[2] + dt * u[0], x[3] + dt * u[1]]
+        )
 
     return hw.Nonlinear(
         g, lambda x: x[:2], hw.Gaussian([1e-4, 1e-4, 1e-2, 1e-3]), hw.Gaussian([0.2, 0.2]),
@@ -367,7 +391,9 @@ def turning(loss):
 U = np.c_[np.sin(np.arange(150) / 9), 0.4 * np.cos(np.arange(150) / 15)]
 
 
-@pytest.mark.parametrize("loss", [hw.Bernoulli(0.7), hw.Markov(0.9, 0.8, kind="stale"), hw.Bernoulli(0.8, kind="garbage")], ids=repr)
+@pytest.mark.parametrize(
+    "loss", [hw.Bernoulli(0.7), hw.Markov(0.9, 0.8, kind="stale"), hw.Bernoulli(0.8, kind="garbage")], ids=repr
+)
 def test_extended_form(loss):
     model = turning(loss)
     truth, record = hw.simulate(model, U, seed=3)
@@ -408,7 +434,13 @@ def test_an_angle_is_compared_on_its_nearest_branch():
 # ---- streams
 
 
-STREAMED = [None, hw.Bernoulli(0.7), hw.Markov([0.9, 0.95], [0.8, 0.7]), hw.Markov(0.9, 0.8, kind="stale"), hw.Bernoulli.unknown()]
+STREAMED = [
+    None,
+    hw.Bernoulli(0.7),
+    hw.Markov([0.9, 0.95], [0.8, 0.7]),
+    hw.Markov(0.9, 0.8, kind="stale"),
+    hw.Bernoulli.unknown(),
+]
 
 
 @pytest.mark.parametrize("method", EVERY, ids=repr)
@@ -459,7 +491,12 @@ def test_the_public_stream():
     assert live.rows == 30
     missing = live.push(None, record.u[0])
     assert float(missing.gamma[0]) == 0.0
-    for y, u, dt in (([np.inf, 0.0], [0.0], None), ([1.0], [0.0], None), ([1.0, 2.0], None, None), ([1.0, 2.0], [0.0], 0.0)):
+    for y, u, dt in (
+        ([np.inf, 0.0], [0.0], None),
+        ([1.0], [0.0], None),
+        ([1.0, 2.0], None, None),
+        ([1.0, 2.0], [0.0], 0.0),
+    ):
         with pytest.raises(hw.BadRecord):
             live.push(y, u, dt)
 

@@ -27,7 +27,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth import _core
+import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.derivative import differences
 from halfwidth.errors import BadRecord, BadValue, HalfwidthError, Refused
@@ -88,7 +88,9 @@ class _LossMethod:
         """Settings of the kernel beside the model."""
         return {
             "rule": self._rule,
-            "components": next((int(getattr(self, n)) for n in ("particles", "components", "width") if hasattr(self, n)), 1),
+            "components": next(
+                (int(getattr(self, n)) for n in ("particles", "components", "width") if hasattr(self, n)), 1
+            ),
             "depth": int(getattr(self, "depth", 0)),
             "spread": bool(getattr(self, "spread", True)),
             "threshold": float(getattr(self, "threshold", 0.5)),
@@ -104,7 +106,9 @@ class _LossMethod:
                     "hint: use `model.as_gaussian()`"
                 )
         if not isinstance(model.x0, Normal):
-            return f"`{name}` needs a Gaussian prior but `x0` is a box\nhint: x0=Normal(mean, P), or `model.as_gaussian()`"
+            return (
+                f"`{name}` needs a Gaussian prior but `x0` is a box\nhint: x0=Normal(mean, P), or `model.as_gaussian()`"
+            )
         if model.bounds is not None:
             return f"`{name}` knows no bounds on the state\nhint: leave `bounds` away"
         if isinstance(model, Linear) and model.theta_entries:
@@ -121,14 +125,20 @@ class _LossMethod:
         if not isinstance(loss, Bernoulli | Markov):
             return f"`{name}` does not know the loss {loss!r}\nhint: loss=Bernoulli(0.7) or loss=Markov(0.95, 0.85)"
         modes = len(loss.patterns(len(loss.groups(model.ny))))
-        cells = modes ** (self._settings["depth"] + 1) if self._rule == _AVERAGE else modes * self._settings["components"]
+        cells = (
+            modes ** (self._settings["depth"] + 1) if self._rule == _AVERAGE else modes * self._settings["components"]
+        )
         if self._rule in (_AVERAGE, _MERGE) and cells > _MOST_CELLS:
             return f"`{typed(self)}` would carry {cells} components, at most {_MOST_CELLS} are possible\nhint: {name}()"
         if self._rule == _MERGE and self._settings["components"] < modes and isinstance(loss, Markov):
-            return f"`{typed(self)}` needs a component for each of the {modes} modes\nhint: {name}(components={2 * modes})"
+            return (
+                f"`{typed(self)}` needs a component for each of the {modes} modes\nhint: {name}(components={2 * modes})"
+            )
         if not loss.known:
             if self._rule == _AVERAGE and self._settings["depth"] == 0 and isinstance(loss, Markov):
-                return f"`{name}` forgets what it must count to learn the loss\nhint: use `GPB(depth=1)`, or give the law"
+                return (
+                    f"`{name}` forgets what it must count to learn the loss\nhint: use `GPB(depth=1)`, or give the law"
+                )
             if self._smoothing and self._rule != _AVERAGE:
                 return f"`{name}` cannot learn the loss while it smooths\nhint: use `GPB(depth=3, smooth=True)`"
         return None
@@ -205,7 +215,7 @@ class _LossMethod:
         learn_law = 0 if loss is None or loss.known or smooth else 1 if isinstance(loss, Bernoulli) else 2
         out: dict[str, Any] = _core.loss_filter(
             rows.A, rows.b, rows.Q, modes.C, modes.d, modes.R, modes.Pi, y, record.seen, model.x0.mean, model.x0.P,  # type: ignore[union-attr]
-            modes.pi0, modes.count,
+            modes.pi0, modes.prior,
             groups=1 if loss is None else len(loss.groups(record.ny)), learn=learn_law, seed=seed,
             prior_predicted=self.prior == "predicted", smooth=smooth, lag=lag, **self._settings,
         )  # fmt: skip
@@ -226,7 +236,9 @@ class _LossMethod:
         status = Status.OK
         if out["code"] == _NOT_FINITE:
             status = Status.COLLAPSED
-            info["message"] = f"the numbers overflowed at t = {record.t[out['bad_row']]:.6g} s; the rows from there repeat the last answer"
+            info["message"] = (
+                f"the numbers overflowed at t = {record.t[out['bad_row']]:.6g} s; later rows repeat the last answer"
+            )
         elif out["void_rows"]:
             status = Status.REDUCED
             info["message"] = f"{out['void_rows']} rows could be explained in no way and were left unused"
@@ -249,7 +261,8 @@ class _LossMethod:
     def _filter(self) -> "_LossMethod":
         """Return the method without smoothing."""
         changes = {"smooth": False, "lag": None}
-        return dataclasses.replace(self, **{k: v for k, v in changes.items() if hasattr(self, k)})
+        kept: dict[str, Any] = {k: v for k, v in changes.items() if hasattr(self, k)}
+        return dataclasses.replace(self, **kept)
 
 
 @dataclass(frozen=True)
@@ -271,7 +284,8 @@ class BKF1(_LossMethod):
     Examples
     --------
     >>> import halfwidth as hw
-    >>> walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(0.1), hw.Gaussian(1.0), hw.Normal([9.0], 1.0), loss=hw.Bernoulli(0.7))
+    >>> noise = {"w": hw.Gaussian(0.1), "e": hw.Gaussian(1.0), "x0": hw.Normal([9.0], 1.0)}
+    >>> walk = hw.Linear([[1]], None, [[1]], **noise, loss=hw.Bernoulli(0.7))
     >>> hw.estimate(walk, hw.Record([0.0, 1.0, 2.0], [9.2, -0.3, 8.9]), BKF1()).gamma
     array([1., 0., 1.])
     """
@@ -328,7 +342,8 @@ class GPB(_LossMethod):
     Examples
     --------
     >>> import halfwidth as hw
-    >>> walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(0.1), hw.Gaussian(1.0), hw.Normal([9.0], 1.0), loss=hw.Bernoulli(0.7))
+    >>> noise = {"w": hw.Gaussian(0.1), "e": hw.Gaussian(1.0), "x0": hw.Normal([9.0], 1.0)}
+    >>> walk = hw.Linear([[1]], None, [[1]], **noise, loss=hw.Bernoulli(0.7))
     >>> hw.estimate(walk, hw.Record([0.0, 1.0, 2.0], [9.2, -0.3, 8.9]), GPB(depth=2, smooth=True)).gamma.round(3)
     array([1., 0., 1.])
     """
@@ -420,16 +435,17 @@ class BeamSearch(_LossMethod):
     _rule = _BEAM
 
 
-# ---- model and record to the kernel's arrays ---------------------------------------------------------------------------
+# ---- model and record to the kernel's arrays -------------------------------------------------------------------------
 
 
 def linear_rows(model: Linear, record: Record) -> _Rows:
     """Lay out a linear model for the rows of a record, with E and F multiplied out."""
     dt = record.steps(model.dt)
     of = {name: _stacked(matrix.stack(record.t, dt)) for name, matrix in model.matrices.items()}
-    A, C = of["A"], of["C"]
+    A: Any = of["A"]
+    C: Any = of["C"]
+    b: Any = None
     Q, R = (_stacked(noise.cov().stack(record.t, dt)) for noise in (model.w, model.e))
-    b = None
     if record.u is not None:
         b = np.einsum("tij,tj->ti", np.broadcast_to(of["B"], (len(record), *of["B"].shape[1:])), record.u)
     if "E" in of:
@@ -437,7 +453,10 @@ def linear_rows(model: Linear, record: Record) -> _Rows:
         b = None if b is None else np.linalg.solve(of["E"], b[..., None])[..., 0]
     if "F" in of:
         C, R = np.linalg.solve(of["F"], C), _unmixed(of["F"], R)
-    return _Rows(*(None if a is None else np.ascontiguousarray(a) for a in (A, b, Q, C, R)), None)  # type: ignore[arg-type]
+    inputs = None if b is None else np.ascontiguousarray(b)
+    return _Rows(
+        np.ascontiguousarray(A), inputs, np.ascontiguousarray(Q), np.ascontiguousarray(C), np.ascontiguousarray(R), None
+    )
 
 
 def _stacked(found: tuple[Array, NDArray[np.int32] | None]) -> Array:
@@ -467,9 +486,7 @@ def _modes(rows: _Rows, loss: Loss | None, record: Record) -> tuple[Array, Modes
     return y, modes
 
 
-def received(
-    loss: Loss | None, modes: Array, seen: NDArray[np.bool_]
-) -> tuple[Array | None, Mapping[str, Array]]:
+def received(loss: Loss | None, modes: Array, seen: NDArray[np.bool_]) -> tuple[Array | None, Mapping[str, Array]]:
     """Return gamma and the probability of each kind of loss from those of the modes, (T, M)."""
     ny = seen.shape[1]
     if loss is None:
@@ -588,7 +605,7 @@ def _now(loss: Any, law: Array) -> Any:
     return revised(loss, stay_received=_shaped(law[:, 1], loss), stay_lost=_shaped(1 - law[:, 0], loss))
 
 
-# ---- row by row --------------------------------------------------------------------------------------------------------
+# ---- row by row ------------------------------------------------------------------------------------------------------
 
 
 class _Belief:
@@ -643,7 +660,9 @@ class LossStream:
         self.pushed, self.loglik, self.t = 0, 0.0, float(t)
         self._kind = type("NewestLoss", (Newest,), {"__slots__": (), "method": typed(method), "names": model.names.x})
         self._u = isinstance(model, Linear) and model.B is not None
-        self._fixed = isinstance(model, Linear) and all(m.constant for m in (*_matrices(model), model.w.cov(), model.e.cov()))
+        self._fixed = isinstance(model, Linear) and all(
+            m.constant for m in (*_matrices(model), model.w.cov(), model.e.cov())
+        )
         self._stale = loss is not None and "stale" in loss.kind
         self._quick = self._fixed and not self._stale
         self._none = np.full(model.ny, np.nan)
@@ -661,7 +680,7 @@ class LossStream:
         return _core.LossStream(
             n=model.nx, m=model.ny, modes=modes.C.shape[1], groups=1 if loss is None else len(loss.groups(model.ny)),
             learn=0 if loss is None or loss.known else 1 if isinstance(loss, Bernoulli) else 2, seed=self._seed,
-            x0=self._x, P0=self._P, pi0=modes.pi0, count=modes.count, **self.method._settings,
+            x0=self._x, P0=self._P, pi0=modes.pi0, count=modes.prior, **self.method._settings,
         )  # fmt: skip
 
     def push(self, y: Any, u: Any = None, dt: float | None = None) -> Newest:
@@ -710,7 +729,7 @@ class LossStream:
     def snapshot(self) -> bytes:
         """Return everything a later process needs to go on."""
         head = np.concatenate([[self.pushed, self.t, self.loglik], self._last, self._x, self._P.ravel()])
-        return head.tobytes() + self._core.state()
+        return bytes(head.tobytes() + self._core.state())
 
     def restore(self, saved: bytes) -> None:
         """Go on from a state of the same model and method.
@@ -760,14 +779,14 @@ class LossStream:
         """Return the modes of one row, the values reported before it standing above it."""
         above = [self._last] if self._stale and not np.isnan(self._last).all() else []
         outputs = np.stack([*above, y])
-        found = _modes(rows, self.model.loss, Record(np.arange(len(outputs)) * 1.0, outputs))[1]
+        found = _modes(rows, self.model.loss, Record(np.arange(len(outputs), dtype=np.float64), outputs))[1]
         return found._replace(d=None if found.d is None else found.d[-1:])
 
     def _input(self, u: Any) -> Array:
         given = np.array([] if u is None else u, dtype=np.float64, ndmin=1)
         if given.shape != (self.model.nu,) or not np.isfinite(given).all():
             raise BadRecord(f"`u` is {u!r}, {self.model.nu} finite numbers were expected", hint="push(y, u)")
-        return np.ascontiguousarray(self._B @ given)
+        return np.ascontiguousarray(self._B @ given)  # type: ignore[operator]
 
     def _prepare(self, u: Array | None, dt: float, y: Array | None = None) -> _Rows:
         """Return the linear model of one row; a `Nonlinear` one is linearised about the mixture's mean."""
@@ -784,7 +803,9 @@ class LossStream:
             return rows
         u = np.zeros(model.nu) if u is None else u
         moves = self.pushed > 0 or self.method.prior == "filtered"
-        return _tangent(model, self._x if moves else None, self._x, np.sqrt(np.diagonal(self._P)), u, dt, self.t + dt, y)
+        return _tangent(
+            model, self._x if moves else None, self._x, np.sqrt(np.diagonal(self._P)), u, dt, self.t + dt, y
+        )
 
 
 def _whole(method: Any, name: str, least: int) -> None:
