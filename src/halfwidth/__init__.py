@@ -45,6 +45,7 @@ _HOME: dict[str, str] = {
     "BadValue": "errors",
     "BadRecord": "errors",
     "BadLog": "errors",
+    "LogTooBig": "errors",
     "Refused": "errors",
     "Missing": "errors",
     "Unsolved": "errors",
@@ -52,6 +53,9 @@ _HOME: dict[str, str] = {
     "Estimator": "methods._protocol",
     "Recursive": "methods._protocol",
 } | {name: f"methods.{module}" for name, module in ESTIMATORS.items()}
+
+#: Packages that are part of the public names, loaded when first used as well.
+_PACKAGES = ("vehicle",)
 
 __all__ = ["__version__", *sorted(_HOME)]
 
@@ -63,6 +67,7 @@ if TYPE_CHECKING:
     from halfwidth.errors import BadValue as BadValue
     from halfwidth.errors import DataQualityWarning as DataQualityWarning
     from halfwidth.errors import HalfwidthError as HalfwidthError
+    from halfwidth.errors import LogTooBig as LogTooBig
     from halfwidth.errors import Missing as Missing
     from halfwidth.errors import Refused as Refused
     from halfwidth.errors import Unsolved as Unsolved
@@ -102,6 +107,8 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return importlib.import_module(f"halfwidth.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'halfwidth' has no attribute {name!r}")
     value = getattr(importlib.import_module(f"halfwidth.{_HOME[name]}"), name)

@@ -18,6 +18,8 @@ DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("KalmanSmoother", {}),
     ("UnscentedKalman", {"smooth": True}),
     ("GPB", {"depth": 5, "smooth": True}),
+    ("BatchLP", {}),
+    ("ParticleFilter", {}),
 )
 
 

@@ -205,7 +205,7 @@ class Nonlinear:
     Parameters
     ----------
     g : function (x, u) -> (nx,), or (x, u, dt), or (x)
-        Motion over one step of `dt` seconds. Written in NumPy without branching on values it runs compiled.
+        Motion over one step of `dt` seconds. Written with functions of NumPy (not of `math`) it runs compiled.
     h : function (x) -> (ny,)
         Output.
     w, e : Uniform, Gaussian or their sum

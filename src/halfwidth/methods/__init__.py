@@ -17,6 +17,7 @@ ESTIMATORS: dict[str, str] = {
     "FearnheadClifford": "loss",
     "Runnalls": "loss",
     "BeamSearch": "loss",
+    "BatchLP": "map",
 }
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from halfwidth import methods
 from halfwidth.array import Array
 from halfwidth.derivative import differences
-from halfwidth.errors import BadShape, BadValue, Refused, hinted
+from halfwidth.errors import BadShape, BadValue, HalfwidthError, Refused, hinted
 from halfwidth.methods._deviations import Function, Spread, scan
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear, arity
@@ -396,7 +396,10 @@ def _same_slope(user: Callable[..., Any], name: str, tape: Tape, points: list[tu
     shape = (len(tape.out), tape.sizes[0])
     for arguments in points:
         wanted = arity(user, 3 if name == "g" else 1)
-        given = _valued(user, f"{name}_x", shape, (np.array(arguments[0]), *arguments[1:])[:wanted], 0.0)
+        try:
+            given = _valued(user, f"{name}_x", shape, (np.array(arguments[0]), *arguments[1:])[:wanted], 0.0)
+        except HalfwidthError:  # met on the way, it is named there
+            return False
         exact = tape.jacobian(*arguments)[1][0]
         if np.isfinite(exact).all() and not np.allclose(given, exact, rtol=1e-6, atol=1e-9 * np.abs(exact).max()):
             return False
@@ -420,7 +423,7 @@ def _judged(found: dict[str, Any], t: Array) -> tuple[Status, str | None]:
         "bad_g": (Status.COLLAPSED, "`g` was not finite, so the state was held, in"),
         "bad_h": (Status.REDUCED, "`h` was not finite, so the output was left out, in"),
         "contradicted": (Status.REDUCED, "an output without noise contradicts its certain prediction in"),
-        "repaired": (Status.REDUCED, "a covariance was kept positive semidefinite by leaving out a negative weight in"),
+        "repaired": (Status.REDUCED, "a covariance that a negative weight or rounding made indefinite was repaired in"),
     }
     status, parts = Status.OK, []
     for key, (meaning, words) in said.items():
