@@ -63,9 +63,7 @@ def limit():
     """Compile the hand-written loop."""
     folder = tempfile.mkdtemp()
     library = os.path.join(folder, "limit.so")
-    subprocess.run(
-        ["g++", "-O3", "-shared", "-fPIC", "-o", library, str(HERE / "kalman_limit.cpp")], check=True
-    )
+    subprocess.run(["g++", "-O3", "-shared", "-fPIC", "-o", library, str(HERE / "kalman_limit.cpp")], check=True)
     call = ctypes.CDLL(library).kf_rts
     call.restype = ctypes.c_double
     return call
@@ -133,9 +131,7 @@ def kalman():
     loop = Loop(model, record.y, rows)
     method = hw.KalmanSmoother()
     loglik, est = loop(), hw.estimate(model, record, method)
-    error = max(
-        difference(est.x, loop.x[2]), difference(est.P, loop.P[2]), abs(est.loglik / loglik - 1.0)
-    )
+    error = max(difference(est.x, loop.x[2]), difference(est.P, loop.P[2]), abs(est.loglik / loglik - 1.0))
     ours, hand = best(lambda: hw.estimate(model, record, method), loop, repeats=15)
     lines = [
         ("", "ms", "ns a step", "x C++ loop", "error"),
@@ -149,7 +145,9 @@ def kalman():
         out = ss.smooth()
         error = max(difference(out.smoothed_state.T, loop.x[2]), difference(out.smoothed_state_cov.T, loop.P[2]))
         slow, hand = best(ss.smooth, loop, repeats=3)
-        lines.append(("statsmodels", f"{slow * 1e3:.0f}", f"{slow / T * 1e9:.0f}", f"{slow / hand:.1f}", f"{error:.0e}"))
+        lines.append(
+            ("statsmodels", f"{slow * 1e3:.0f}", f"{slow / T * 1e9:.0f}", f"{slow / hand:.1f}", f"{error:.0e}")
+        )
         lines.append(("statsmodels / halfwidth", f"{slow / ours:.0f} x", "", "", ""))
     table(f"KF + RTS, T = {T:,}, n = 4, m = 2, 30 % of the rows missing", lines)
 
@@ -290,7 +288,12 @@ def learn():
             kf = theirs()
             (slow,) = best(theirs, repeats=1)
         at = hw.Linear(
-            truth.A, None, truth.C, hw.Gaussian(kf.transition_covariance), hw.Gaussian(kf.observation_covariance), truth.x0
+            truth.A,
+            None,
+            truth.C,
+            hw.Gaussian(kf.transition_covariance),
+            hw.Gaussian(kf.observation_covariance),
+            truth.x0,
         )
         reached = hw.estimate(at, record, hw.KalmanFilter()).loglik
         row(f"pykalman, {n_iter} EM iterations, Q and R full", slow, reached, np.asarray(kf.observation_covariance))
@@ -310,12 +313,12 @@ def growth():
     long, _ = drawn(model, 1_000_000, seed=3)
     a, b = best(lambda: hw.estimate(model, short, method), lambda: hw.estimate(model, long, method), repeats=5)
     code = (
-        "import numpy as np, sys; sys.path.insert(0, {here!r}); import speed, halfwidth as hw\n"
+        f"import numpy as np, sys; sys.path.insert(0, {str(HERE)!r}); import speed, halfwidth as hw\n"
         "def status(key): return int(open('/proc/self/status').read().split(key)[1].split()[0]) * 1024\n"
         "m = speed.constant_velocity(); r, _ = speed.drawn(m, 10); hw.estimate(m, r)\n"
         "T = 1000000; r = hw.Record(np.arange(1.0, T + 1), np.zeros((T, 2)))\n"
         "before = status('VmRSS:'); e = hw.estimate(m, r); print((status('VmHWM:') - before) / T)"
-    ).format(here=str(HERE))
+    )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     table(
         "From T = 100,000 to T = 1,000,000",

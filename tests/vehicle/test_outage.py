@@ -84,10 +84,10 @@ def test_what_cannot_be_tried_is_said(log):
 def test_progress_and_settings(log):
     told = []
     table = outages(
-        log, (1, 5), 2, 1, ("linear", "cv"), clock_offset=0.1, progress=lambda n, total: told.append((n, total))
+        log, (1, 5), 2, 1, ("linear", "cv"), clock_offset=0.1, progress=lambda share, words: told.append((share, words))
     )
-    assert told[-1] == (4, 4)
-    assert [n for n, _ in told] == sorted(n for n, _ in told)
+    assert told[-1] == (1.0, "done")
+    assert [share for share, _ in told] == [0, 0.25, 0.5, 0.75, 1]
     assert table.clock_offset == 0.1
     assert isinstance(table, Outages)
 

@@ -113,7 +113,7 @@ def two_antenna_linear(q: Given = None, r: Given = None, *, antennas: int = 2, x
     """
     names = tuple(f"{axis}{k + 1 if antennas > 1 else ''}" for k in range(antennas) for axis in ("east", "north"))
     return Linear(
-        np.eye(2 * antennas),
+        lambda dt: np.eye(2 * antennas),  # noqa: ARG005 - the input holds the step, whatever its length
         np.tile(np.eye(2), (antennas, 1)),
         np.eye(2 * antennas),
         _noise(q),

@@ -33,7 +33,7 @@ MARGIN = 20.0
 #: The vehicle must average more than this in an outage, m/s.
 MIN_SPEED = 1.0
 
-Progress = Callable[[int, int], None]
+Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,8 +280,8 @@ def outages(
         Seconds to add to the time stamps of speed and yaw rate, see `sampled`; 0 if absent.
     level : float
         Level of the intervals whose coverage is counted.
-    progress : function (n, total), optional
-        Called with the number of cells done and of all.
+    progress : function (share, words), optional
+        Called with the share done, 0 to 1, and what is being done.
 
     Returns
     -------
@@ -324,10 +324,10 @@ def outages(
         tuned = m.tune(drive) if tried else {}
         for length in tried:
             if progress is not None:
-                progress(len(cells), total)
+                progress(len(cells) / total, f"{m.name}, {length:g} s")
             cells.append(_cell(drive, m, tuned, length, places[length], level))
     if progress is not None:
-        progress(total, total)
+        progress(1.0, "done")
     return Outages(drive_log.source, tuple(cells), level, seed, offset, MappingProxyType(skipped))
 
 
