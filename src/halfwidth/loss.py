@@ -18,7 +18,7 @@ References
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -53,6 +53,7 @@ class _Loss:
 
     kind: tuple[str, ...]
     noise: Array | None
+    noise_of: Mapping[str, Array]
     center: Array
     sensors: tuple[tuple[int, ...], ...] | None
     worth: float | None
@@ -112,10 +113,10 @@ class _Loss:
         """Return the covariance of what arrives when a sample is lost, shaped as R (..., ny, ny)."""
         ny = R.shape[-1]
         diagonal = np.diagonal(R, axis1=-2, axis2=-1)
-        if self.noise is None:
+        given = self.noise_of.get(kind, self.noise)
+        if given is None:
             scale = {"noise": None, "stale": _STALE, "garbage": _GARBAGE}[kind]
             return R if scale is None else scale * diagonal[..., None] * np.eye(ny)
-        given = self.noise
         if given.ndim < 2:
             given = np.diag(np.broadcast_to(given, (ny,)))
         if given.shape != (ny, ny):
@@ -152,7 +153,7 @@ class _Loss:
         Rm = np.where(both, R[:, None], 0.0)
         for kind, where in lost.items():
             pair = where[:, :, None] & where[:, None, :]
-            if kind == "noise" and self.noise is None:  # the same noise, whether or not the sample is in it
+            if kind == "noise" and self.noise is None and "noise" not in self.noise_of:  # the same noise, whether or not the sample is in it
                 pair |= (where | received)[:, :, None] & (where | received)[:, None, :]
             Rm = np.where(pair, self.cov(kind, R)[:, None], Rm)
         d: Array | None = None
@@ -215,7 +216,7 @@ class _Loss:
             v = np.asarray(np.linalg.solve(np.broadcast_to(F, (T, ny, ny)), e[..., None])[..., 0], dtype=np.float64)
         R = np.cov(v.T).reshape(ny, ny) if T > 1 else np.eye(ny)
         draws = {kind: rng.multivariate_normal(np.zeros(ny), self.cov(kind, R), T, method="eigh") for kind in self.kind}
-        if self.noise is None and "noise" in draws:
+        if self.noise is None and "noise" in draws and "noise" not in self.noise_of:
             draws["noise"] = v
         out, received = y.copy(), np.ones((T, ny), dtype=bool)
         state = np.zeros(G, dtype=int)
@@ -250,9 +251,10 @@ class Bernoulli(_Loss):
         or 1 the loss is known.
     kind : str or sequence of str
         What arrives instead: "noise", "stale", "garbage", or several of them, equally likely.
-    noise : scalar, (ny,) or (ny, ny) array_like, optional
+    noise : scalar, (ny,) or (ny, ny) array_like, or mapping of kind to such, optional
         Covariance of what arrives instead. If absent: that of e for "noise", a millionth of its diagonal for "stale"
-        (a thousandth of its standard deviation), ten thousand times its diagonal for "garbage". It needs one `kind`.
+        (a thousandth of its standard deviation), ten thousand times its diagonal for "garbage". A mapping where there
+        are several kinds.
     center : scalar or (ny,) array_like
         Mean of pure noise.
     sensors : sequence of sequences of int, optional
@@ -280,7 +282,7 @@ class Bernoulli(_Loss):
         received: ArrayLike,
         *,
         kind: str | Sequence[str] = "noise",
-        noise: ArrayLike | None = None,
+        noise: ArrayLike | Mapping[str, ArrayLike] | None = None,
         center: ArrayLike = 0.0,
         sensors: Sequence[Sequence[int]] | None = None,
     ) -> None:
@@ -364,7 +366,7 @@ class Markov(_Loss):
         *,
         start: ArrayLike | None = None,
         kind: str | Sequence[str] = "noise",
-        noise: ArrayLike | None = None,
+        noise: ArrayLike | Mapping[str, ArrayLike] | None = None,
         center: ArrayLike = 0.0,
         sensors: Sequence[Sequence[int]] | None = None,
     ) -> None:
@@ -474,7 +476,7 @@ def _together(law: Array, n_sensors: int, T: int) -> Array:
 def _common(
     loss: _Loss,
     kind: str | Sequence[str],
-    noise: ArrayLike | None,
+    noise: ArrayLike | Mapping[str, ArrayLike] | None,
     center: ArrayLike,
     sensors: Sequence[Sequence[int]] | None,
 ) -> None:
@@ -483,22 +485,14 @@ def _common(
     if not kinds or len(set(kinds)) != len(kinds) or any(k not in KINDS for k in kinds):
         raise BadValue(f"`kind` is {kind!r}, one or several of {', '.join(KINDS)} were expected", hint='kind="noise"')
     put(loss, "kind", kinds)
-    given = None if noise is None else real(noise, "noise")
-    if given is not None:
-        if len(kinds) > 1:
-            raise BadValue(
-                f"`noise` is given for {len(kinds)} kinds of loss, one kind was expected", hint="leave it away"
-            )
-        if given.ndim > 2 or (given.ndim == 2 and given.shape[0] != given.shape[1]):
-            raise BadShape(f"`noise` has shape {given.shape}, a scalar, (ny,) or (ny, ny) was expected")
-        given = covariance(given, "noise") if given.ndim == 2 else given
-        lowest = np.linalg.eigvalsh(given)[0] if given.ndim == 2 else np.min(given)
-        if lowest <= 0:
-            raise BadValue(
-                f"`noise` has the variance {lowest:.3g}, above 0 was expected: a sample is judged by its density",
-                hint="noise=1e-6 for a repeat that is exact to a thousandth",
-            )
-    put(loss, "noise", None if given is None else frozen(given))
+    several = noise if isinstance(noise, Mapping) else {}
+    if set(several) - set(kinds) or (noise is not None and not several and len(kinds) > 1):
+        raise BadValue(
+            f"`noise` is {noise!r} for the kinds {kinds}, one kind or a mapping of some of them was expected",
+            hint=f"noise={{{kinds[0]!r}: 1.0}}",
+        )
+    put(loss, "noise_of", {kind: _covariance(value) for kind, value in several.items()})
+    put(loss, "noise", None if noise is None or several else _covariance(noise))  # type: ignore[arg-type]
     middle = real(center, "center")
     if middle.ndim > 1:
         raise BadShape(f"`center` has shape {middle.shape}, a scalar or (ny,) was expected")
@@ -506,6 +500,20 @@ def _common(
     put(loss, "sensors", None if sensors is None else tuple(tuple(int(i) for i in group) for group in sensors))
     put(loss, "worth", None)
     put(loss, "unknown_noise", False)
+
+
+def _covariance(value: ArrayLike) -> Array:
+    given = real(value, "noise")
+    if given.ndim > 2 or (given.ndim == 2 and given.shape[0] != given.shape[1]):
+        raise BadShape(f"`noise` has shape {given.shape}, a scalar, (ny,) or (ny, ny) was expected")
+    given = covariance(given, "noise") if given.ndim == 2 else given
+    lowest = float(np.linalg.eigvalsh(given)[0] if given.ndim == 2 else np.min(given))
+    if lowest <= 0:
+        raise BadValue(
+            f"`noise` has the variance {lowest:.3g}, above 0 was expected: a sample is judged by its density",
+            hint="noise=1e-6 for a repeat that is exact to a thousandth",
+        )
+    return frozen(given)
 
 
 def _unknown(loss: Any, worth: float, learn_noise: bool) -> Any:
@@ -556,6 +564,8 @@ def _show(loss: _Loss, numbers: list[Array]) -> str:
         )
     if loss.noise is not None:
         parts.append("noise=" + np.array2string(loss.noise, precision=4, separator=", ").replace("\n", ""))
+    if loss.noise_of:
+        parts.append("noise={...}")
     if loss.sensors is not None:
         parts.append(f"sensors={[list(g) for g in loss.sensors]}")
     name = type(loss).__name__

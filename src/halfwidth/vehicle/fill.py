@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle import calibrate, chain
+from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, usable
 from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.grid import Grid, sampled
@@ -51,6 +52,7 @@ def fill(
     method: str | None = None,
     level: float = 0.9,
     clock_offset: float | None = None,
+    distrust: bool = True,
 ) -> Track:
     """Fill the gaps of a log.
 
@@ -66,6 +68,8 @@ def fill(
     clock_offset : float, optional
         Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; 0 if
         absent.
+    distrust : bool
+        Whether fixes that are frozen or jump away are found and bridged; the track's messages name them.
 
     Returns
     -------
@@ -87,8 +91,12 @@ def fill(
     if not drive_log.fixed.any():
         raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
     offset = 0.0 if clock_offset is None else float(clock_offset)
-    grid = sampled(drive_log, clock_offset=offset)
     messages: list[str] = []
+    if distrust:
+        doubtful = distrusted(drive_log)
+        messages.extend(doubtful.words(drive_log))
+        drive_log = doubtful.masked(drive_log)
+    grid = sampled(drive_log, clock_offset=offset)
     chosen = _chosen(grid, asked, messages)
     if clock_offset is None and chosen.name not in ("linear", "cv"):
         messages.append("the clocks of fixes and sensors were taken to agree")
