@@ -386,8 +386,11 @@ def test_demo(tmp_path, capsys):
     data = json.loads(capsys.readouterr().out)
     assert len(data["tunnels"]) == 3
     assert os.path.exists(data["report"])
+    assert cli.run(["demo", "-o", str(folder), "-q"]) == GOOD  # the same again
+    capsys.readouterr()
+    (folder / "track.gpx").rename(folder / "mine.gpx")
     assert cli.run(["demo", "-o", str(folder)]) == USAGE
-    assert "holds files already" in capsys.readouterr().err
+    assert "holds other files already" in capsys.readouterr().err
 
 
 def test_doctor(capsys):

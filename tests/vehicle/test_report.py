@@ -119,7 +119,7 @@ def test_one_gap_is_singular_and_no_gap_says_so():
     [
         (
             "credible",
-            "90 % credible interval: where a fix would be, east and north each lie inside with probability 90 %",
+            "90 % credible interval: east and north each lie inside with probability 90 %",
         ),
         ("proven", "proven bound: it holds as long as the noise stays within"),
         ("none", "an indication of size: no probability is claimed"),

@@ -118,8 +118,8 @@ class Log:
             row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
             raise BadValue(
                 f"`t` goes from {t[row - 1]:.10g} s to {t[row]:.10g} s in row {row}, strictly"
-                " increasing times are expected\nhint: `halfwidth.vehicle.from_frame` sorts rows"
-                " and joins those with equal times"
+                " increasing times are expected",
+                hint="`halfwidth.vehicle.from_frame` sorts rows and joins those with equal times",
             )
         object.__setattr__(self, "t", t)
         for name in STREAMS:
@@ -285,7 +285,7 @@ def to_frame(columns: Mapping[str, Any], native: str) -> Any:
     try:
         library = import_module(native)
     except ImportError as error:
-        raise Missing(f"`native` is {native!r} but {native} is not installed\nhint: pip install {native}") from error
+        raise Missing(f"`native` is {native!r} but {native} is not installed", hint=f"pip install {native}") from error
     table = {name: np.array(values) for name, values in columns.items()}
     return library.table(table) if native == "pyarrow" else library.DataFrame(table)
 
