@@ -76,12 +76,12 @@ def particles_filter(car, record, N=100):
 
     class Lossy(FeynmanKac):
         def M0(self, N):
-            return self.M(0, car.x0.mean + np.random.standard_normal((N, 4)))
+            return self.M(0, car.x0.mean + dists.MvNormal(cov=np.eye(4)).rvs(size=N))
 
-        def M(self, t, xp):
+        def M(self, t, xp):  # noqa: ARG002
             return xp @ A.T + noise.rvs(size=len(xp))
 
-        def logG(self, t, xp, x):
+        def logG(self, t, xp, x):  # noqa: ARG002
             y = record.y[t]
             kept = np.log(0.7) - 0.5 * np.sum((y - x @ C.T) ** 2 / R, axis=1)
             lost = np.log(0.3) - 0.5 * np.sum(y**2 / R)

@@ -121,7 +121,7 @@ class _Loss:
             given = np.diag(np.broadcast_to(given, (ny,)))
         if given.shape != (ny, ny):
             raise BadShape(
-                f"`noise` of the loss has shape {self.noise.shape}, ({ny}, {ny}) was expected from the model"
+                f"`noise` of the loss has shape {given.shape}, ({ny}, {ny}) was expected from the model"
             )
         return np.broadcast_to(given, R.shape)
 
@@ -153,7 +153,9 @@ class _Loss:
         Rm = np.where(both, R[:, None], 0.0)
         for kind, where in lost.items():
             pair = where[:, :, None] & where[:, None, :]
-            if kind == "noise" and self.noise is None and "noise" not in self.noise_of:  # the same noise, whether or not the sample is in it
+            if (
+                kind == "noise" and self.noise is None and "noise" not in self.noise_of
+            ):  # the same noise, whether or not the sample is in it
                 pair |= (where | received)[:, :, None] & (where | received)[:, None, :]
             Rm = np.where(pair, self.cov(kind, R)[:, None], Rm)
         d: Array | None = None

@@ -61,7 +61,9 @@ def test_freezes_of_a_real_log(data, seed):
     assert rms(believing, log, rows) > 5 * rms(track, log, rows)
 
 
-@pytest.mark.parametrize("name", ["smartloc_berlin_potsdamer_platz", "balzer_dresden_2014_03_26", "driveplotr_nds_drive18"])
+@pytest.mark.parametrize(
+    "name", ["smartloc_berlin_potsdamer_platz", "balzer_dresden_2014_03_26", "driveplotr_nds_drive18"]
+)
 def test_real_logs_are_left_in_peace(data, name):
     log = vehicle.read(data / f"{name}.csv.gz")
     assert len(distrusted(log)) <= 0.005 * log.fixed.sum()

@@ -15,8 +15,9 @@ of depth 10. Two negative controls: the chi-square gate, which is today's practi
 knows only how often samples are lost (Nahi 1969, IEEE Transactions on Information Theory 15).
 """
 
+import pathlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 import halfwidth as hw
 from halfwidth.array import Array
+from halfwidth.reproduce import Table
 
 BURSTS = (0.95, 0.85)
 
@@ -285,52 +287,107 @@ def learned(*, T: int = 2000, runs: int = 8, depth: int = 3, seed: int = 6) -> d
     return {"S1": np.array(p), "S2": np.array(stay), "drops": np.array(drops)}
 
 
-def main(*, quick: bool = False, say: Callable[[str], None] = print) -> None:
-    """Print the tables.
-
-    Parameters
-    ----------
-    quick : bool
-        A tenth of the runs.
-    say : function (str)
-        Where lines go.
-    """
+def tables(*, quick: bool = False) -> tuple[Table, ...]:
+    """Return the tables; `quick` takes a tenth of the records."""
     runs, short = (15, 6) if quick else (150, 30)
     cases = scenarios()
-    say(f"Unknown losses: {runs} records of 60 rows a scenario. RMSE of the position, wrongly judged samples, distance")
-    say("of the mean to a pseudo-Bayes filter of depth 10, processor time a row (one record at a time, from Python).")
+    found = []
     for name, case in cases.items():
-        say(f"\n{name:24s} {'RMSE':>8s} {'wrong %':>8s} {'distance':>9s} {'us/row':>8s}")
-        for method, s in accuracy(case, runs=runs).items():
-            wrong = f"{100 * s.gamma:8.2f}" if np.isfinite(s.gamma) else f"{'':8s}"
-            cost = f"{s.microseconds:8.2f}" if np.isfinite(s.microseconds) else ""
-            say(f"{method:24s} {s.rmse:8.4f} {wrong} {s.distance:9.4f} {cost}")
-    say(
-        f"\nAgainst the exact posterior, T = 12, {short} records: distance of the mean in % of the RMSE"
-        " / largest error of P(received)"
-    )
+        rows = [
+            (method, round(s.rmse, 4), _cell(100 * s.gamma, 2), round(s.distance, 4), _cell(s.microseconds, 2))
+            for method, s in accuracy(case, runs=runs).items()
+        ]
+        found.append(
+            Table(
+                f"{name}: accuracy against cost, {runs} records of 60 rows",
+                ("filter", "RMSE", "wrong %", "distance", "us/row"),
+                tuple(rows),
+                ("position; distance: of the mean to a pseudo-Bayes filter of depth 10; time: one record from Python",),
+            )
+        )
     more = {"RBPF 1000": hw.RBPF(1000, prior="predicted"), "GPB depth 11": hw.GPB(11, prior="predicted")}
-    table = {name: against_exact(case, runs=short, extra=more) for name, case in cases.items()}
-    say(f"{'':24s}" + "".join(f"{name:>20s}" for name in cases))
-    for method in table["S1"]:
-        say(f"{method:24s}" + "".join(f"{100 * d:12.3f} / {g:.0e}" for d, g in (t[method] for t in table.values())))
-    say("\nSmoothers against exact smoothing, the same way")
+    near = {name: against_exact(case, runs=short, extra=more) for name, case in cases.items()}
+    found.append(_pairs(f"Against the exact posterior, T = 12, {short} records", "filter", near))
     smooth = {name: smoothing_against_exact(case, runs=short) for name, case in cases.items()}
-    for depth in smooth["S1"]:
-        say(
-            f"{f'GPB depth {depth}':24s}"
-            + "".join(f"{100 * d:12.3f} / {g:.0e}" for d, g in (t[depth] for t in smooth.values()))
+    found.append(_pairs(f"Smoothers against exact smoothing, T = 12, {short} records", "depth", smooth))
+    late = {name: lags(case, runs=8 if quick else 40) for name, case in cases.items()}
+    found.append(
+        Table(
+            "Wrongly judged samples in % / RMSE of the state, depth 5, T = 100",
+            ("", *cases),
+            tuple((k, *(f"{100 * late[c][k][0]:.2f} / {late[c][k][1]:.3f}" for c in cases)) for k in late["S1"]),
         )
-    say("\nWrongly judged samples in % / RMSE of the state, depth 5, T = 100")
-    for name, case in cases.items():
-        say(
-            f"{name:6s}"
-            + "".join(f"  {k}: {100 * g:.2f} / {r:.3f}" for k, (g, r) in lags(case, runs=8 if quick else 40).items())
+    )
+    T = 500 if quick else 2000
+    law = learned(T=T, runs=3 if quick else 8)
+    laws = [
+        ("received", 0.7, law["S1"][:, 0]),
+        ("stay received", BURSTS[0], law["S2"][:, 0]),
+        ("stay lost", BURSTS[1], law["S2"][:, 1]),
+    ]
+    found.append(
+        Table(
+            f"Laws learned by expectation maximisation, T = {T}, depth 3",
+            ("", "true", "mean", "sd"),
+            tuple((name, true, round(float(v.mean()), 4), round(float(v.std()), 4)) for name, true, v in laws),
+            (f"largest fall of the log-likelihood between iterations: {law['drops'].max():.1e}",),
         )
-    laws = learned(T=500 if quick else 2000, runs=3 if quick else 8)
-    say(f"\nLearned laws, mean and standard deviation: p = 0.7 -> {laws['S1'].mean():.3f}, {laws['S1'].std():.3f};"
-        f" bursts {BURSTS} -> {laws['S2'].mean(axis=0).round(4)}, {laws['S2'].std(axis=0).round(4)}")  # fmt: skip
-    say(f"largest fall of the log-likelihood between iterations: {laws['drops'].max():.1e}")
+    )
+    return tuple(found)
+
+
+def _pairs(title: str, first: str, found: dict[str, dict[Any, tuple[float, float]]]) -> Table:
+    rows = [
+        (str(key), *(f"{100 * part[key][0]:.3f} / {part[key][1]:.0e}" for part in found.values()))
+        for key in next(iter(found.values()))
+    ]
+    return Table(
+        title, (first, *found), tuple(rows), ("distance of the mean in % of the RMSE / largest error of P(received)",)
+    )
+
+
+def _cell(value: float, digits: int) -> float | None:
+    return round(value, digits) if np.isfinite(value) else None
+
+
+def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.Path]:
+    """Draw accuracy against cost, and one crossing target, into a folder; returns the files."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / "paper001_trade.png", folder / "paper001_crossing.png"]
+    figure, axes = plt.subplots(2, 2, figsize=(9, 7), constrained_layout=True)
+    for axis, (name, case) in zip(axes.flat, scenarios().items(), strict=True):
+        for method, s in accuracy(case, runs=15 if quick else 150).items():
+            if np.isfinite(s.microseconds):
+                axis.loglog(s.microseconds, max(s.distance, 1e-5), "o")
+                axis.annotate(method, (s.microseconds, max(s.distance, 1e-5)), fontsize=6)
+        axis.set(title=name, xlabel="microseconds a row", ylabel="distance of the mean to depth 10")
+    figure.savefig(files[0], dpi=120)
+    plt.close(figure)
+    case = scenarios()["S4"]
+    run = simulate(case, 60, 3)
+    smooth = hw.GPB(5, smooth=True, prior="predicted").run(case.model, run.record)
+    decided = hw.BKF1(prior="predicted").run(case.model, run.record)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), constrained_layout=True)
+    left.plot(*run.x[:, [0, 2]].T, "k-", label="truth")
+    left.plot(*run.record.y[run.received].T, "g.", label="received")
+    left.plot(*run.record.y[~run.received].T, "r.", label="noise")
+    left.plot(*decided.x[:, [0, 2]].T, "--", label="BKF-I")
+    left.plot(*smooth.x[:, [0, 2]].T, label="GPB depth 5, smoothed")
+    left.legend(fontsize=7)
+    left.set(xlabel="m", ylabel="m")
+    right.step(run.record.t, run.received, "k", where="mid", label="truth")
+    right.step(run.record.t, smooth.gamma, where="mid", label="P(received)")
+    right.legend(fontsize=7)
+    right.set(xlabel="s")
+    figure.savefig(files[1], dpi=120)
+    plt.close(figure)
+    return files
 
 
 def _with(model: Any, loss: Any) -> Any:

@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 #: Probability that the next fix is trustworthy after one that was, and that trouble goes on.
 _STAY = (0.998, 0.9)
 
-#: Candidates for the standard deviation of a fix (m) and the acceleration's intensity (m^2/s^3); rows they are tried on.
+#: Candidates for the deviation of a fix, m, and the intensity of the acceleration, m^2/s^3; rows to try them on.
 _FIX, _PUSH, _TRIED = (0.02, 0.05, 0.15, 0.5, 1.5, 5.0), (0.3, 1.0, 3.0, 10.0), 1500
 
 #: A jump is garbage of this many standard deviations of a fix, and of this many metres at least.
@@ -66,7 +66,7 @@ class Distrust:
 
     def of(self, why: str) -> NDArray[np.intp]:
         """Return the rows distrusted for one reason."""
-        return self.rows[self.why == why]
+        return np.asarray(self.rows[self.why == why])
 
     def masked(self, log: Log) -> Log:
         """Return the log without these fixes."""
@@ -82,7 +82,10 @@ class Distrust:
     def words(self, log: Log) -> list[str]:
         """Say what was found, with times."""
         found = []
-        for why, said in (("frozen", "repeat the fix before while the car moved"), ("jump", "lie off the path of the others")):
+        for why, said in (
+            ("frozen", "repeat the fix before while the car moved"),
+            ("jump", "lie off the path of the others"),
+        ):
             rows = self.of(why)
             if rows.size:
                 spans = _spans(log.t, rows, np.flatnonzero(log.fixed))
@@ -205,5 +208,3 @@ def _spans(t: Floats, rows: NDArray[np.intp], fixed: NDArray[np.intp]) -> list[t
     at = np.searchsorted(fixed, rows)
     cut = np.flatnonzero(np.diff(at) > 1) + 1
     return [(float(t[part[0]]), float(t[part[-1]])) for part in np.split(rows, cut)]
-
-
