@@ -120,9 +120,7 @@ class _Loss:
         if given.ndim < 2:
             given = np.diag(np.broadcast_to(given, (ny,)))
         if given.shape != (ny, ny):
-            raise BadShape(
-                f"`noise` of the loss has shape {given.shape}, ({ny}, {ny}) was expected from the model"
-            )
+            raise BadShape(f"`noise` of the loss has shape {given.shape}, ({ny}, {ny}) was expected from the model")
         return np.broadcast_to(given, R.shape)
 
     def modes(self, C: Array, R: Array, y: Array, seen: NDArray[np.bool_]) -> Modes:
