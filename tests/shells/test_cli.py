@@ -413,11 +413,11 @@ def test_progress_shows_on_a_terminal_only(monkeypatch):
     assert shown.getvalue() == ""
     monkeypatch.setenv("TERM", "xterm")
     with commands._working("filling", quiet=False) as progress:
-        progress(3, 12)
+        progress(0.25, "em, 1 s")
         deadline = time.monotonic() + 5
-        while "3/12" not in shown.getvalue() and time.monotonic() < deadline:
+        while "25 %" not in shown.getvalue() and time.monotonic() < deadline:
             time.sleep(0.05)
-    assert "\rfilling 3/12, " in shown.getvalue()
+    assert "\rfilling 25 %, em, 1 s, " in shown.getvalue()
     # what was shown is wiped away
     assert shown.getvalue().endswith("\r")
 

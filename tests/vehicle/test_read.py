@@ -406,6 +406,22 @@ def test_a_standing_car_tells_nothing_and_nothing_is_changed(tmp_path):
     assert len(log.notes) == 1
 
 
+def test_a_speed_of_a_wrong_scale_on_a_straight_road_swaps_nothing(tmp_path):
+    columns = drive(lat0=40.0, east_west=True)
+    columns["speed_mps"] = columns["speed_mps"] / np.cos(np.radians(40.0))
+    del columns["azimuth_rad"]
+    log = hw.vehicle.read(save(tmp_path / "log.csv", columns))
+    np.testing.assert_allclose(log.lat_deg, columns["lat_deg"], atol=1e-7)
+
+
+def test_swapped_columns_are_seen_without_an_azimuth(tmp_path):
+    columns = drive()
+    columns["lat_deg"], columns["lon_deg"] = columns["lon_deg"], columns["lat_deg"]
+    del columns["azimuth_rad"]
+    log = hw.vehicle.read(save(tmp_path / "log.csv", columns))
+    np.testing.assert_allclose(log.lat_deg, columns["lon_deg"], atol=1e-7)
+
+
 def test_streams_one_after_the_other_are_sorted_together(tmp_path):
     nan = np.full(1200, np.nan)
     first = {name: TRUE[name] if name in ("t_s", "lat_deg", "lon_deg") else nan for name in TRUE}

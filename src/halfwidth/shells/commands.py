@@ -667,7 +667,7 @@ def _doctor_text(found: Mapping[str, Any]) -> str:
 
 
 @contextmanager
-def _working(what: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+def _working(what: str, quiet: bool) -> Iterator[Callable[[float, str], None] | None]:
     """Show progress on a terminal while something runs: a clock, or a share where it is known."""
     terminal = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
     if quiet or not terminal:
@@ -683,8 +683,8 @@ def _working(what: str, quiet: bool) -> Iterator[Callable[[int, int], None] | No
 
     latest = [""]
 
-    def progress(n: int, total: int) -> None:
-        latest[0] = f"{n}/{total}, "
+    def progress(share: float, words: str) -> None:
+        latest[0] = f"{100 * share:.0f} %, {words}, "
 
     def tick() -> None:
         # short work shows nothing at all

@@ -236,6 +236,25 @@ class Log:
         wide = step > GAP_FACTOR * np.median(step) * (1 + 1e-9)
         return [(float(t[k]), float(t[k + 1])) for k in np.flatnonzero(wide)]
 
+    def with_rows(self, times: ArrayLike) -> "Log":
+        """Return the log with further rows at which nothing arrived, where a position is wanted.
+
+        Parameters
+        ----------
+        times : (K,) array_like
+            Times in seconds, none of them a time of the log.
+
+        Raises
+        ------
+        BadValue
+            If a time is not finite, or is one of the log already.
+        """
+        more = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        t = np.concatenate((self.t, more))
+        order = np.argsort(t, kind="stable")
+        streams = {name: np.concatenate((getattr(self, name), np.full(more.size, np.nan)))[order] for name in STREAMS}
+        return replace(self, t=t[order], **streams)
+
     def rates(self) -> dict[str, float | None]:
         """Give the usual rate of each stream.
 

@@ -573,19 +573,16 @@ def swapped_columns(log: Log) -> bool:
     if not log.fixed.any() or float(np.nanmax(np.abs(log.lon_deg))) > 90:
         return False
     given, other = evidence.speed_ratio(log), evidence.speed_ratio(log, swapped=True)
-    by_speed = (
-        given.enough
-        and other.enough
-        and abs(np.log(other.value)) < 0.1
-        and other.spread < 0.08
-        and (given.spread > 2 * other.spread + 0.02 or abs(np.log(given.value)) > 0.2)
-    )
+    fits = other.enough and abs(np.log(other.value)) < 0.1 and other.spread < 0.08
+    # swapped degrees stretch one direction only, so ratios scatter with the course
+    stretched = given.enough and given.spread > 2 * other.spread + 0.02
     name = "radians clockwise from north"
     course, other_course = evidence.course_errors(log)[name], evidence.course_errors(log, swapped=True)[name]
     if course.enough and other_course.enough:
-        by_course = course.value > 0.4 and other_course.value < 0.15
-        return by_course and (by_speed or not given.enough)
-    return by_speed
+        by_speed = fits and (stretched or abs(np.log(given.value)) > 0.2)
+        return course.value > 0.4 and other_course.value < 0.15 and (by_speed or not given.enough)
+    # a wrong scale of the speed looks alike on a straight road: the stretch alone decides
+    return fits and stretched
 
 
 def _limits(log: Log, notes: list[str], room: float) -> Log:

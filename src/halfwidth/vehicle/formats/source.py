@@ -41,7 +41,7 @@ class Limits:
     rows: int = 20_000_000
     total_bytes: int = 8 << 30
     ratio: float = 100.0
-    ratio_from: int = 2 << 20
+    ratio_from: int = 1 << 19
 
 
 #: First bytes of what is often mistaken for a log, and what to do about it.
