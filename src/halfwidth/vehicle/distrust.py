@@ -68,6 +68,11 @@ class Distrust:
         """Return the rows distrusted for one reason."""
         return np.asarray(self.rows[self.why == why])
 
+    def only(self, why: str) -> "Distrust":
+        """Return those distrusted for one reason."""
+        kept = self.why == why
+        return Distrust(self.rows[kept], self.why[kept], self.probability[kept])
+
     def masked(self, log: Log) -> Log:
         """Return the log without these fixes."""
         if not len(self):

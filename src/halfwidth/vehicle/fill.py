@@ -75,7 +75,8 @@ def fill(
         Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; 0 if
         absent.
     distrust : bool
-        Whether fixes that are frozen or jump away are found and bridged; the track's messages name them.
+        Whether fixes that only repeat the one before while the car moves are found and bridged; the track's messages
+        name them.
 
     Returns
     -------
@@ -99,7 +100,7 @@ def fill(
         raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
     messages: list[str] = []
     if distrust:
-        doubtful = distrusted(drive_log)
+        doubtful = distrusted(drive_log).only("frozen")  # stray ones show against speed and yaw rate, later
         messages.extend(doubtful.words(drive_log))
         drive_log = doubtful.masked(drive_log)
     drive_log = _with_pauses_filled(drive_log, messages)
