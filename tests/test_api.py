@@ -10,6 +10,7 @@ BadLog BadRecord BadShape BadValue BatchLP Box Cloud DataQualityWarning Estimate
 HalfwidthError KalmanFilter KalmanSmoother Learned Linear LogTooBig Missing Mixed Nonlinear Normal ParticleFilter
 Record Recursive Refused Status Uniform UnscentedKalman Unsolved __version__ estimate forecast from_continuous learn
 resume score simulate stream
+BKF1 BKF2 BeamSearch Bernoulli FearnheadClifford GPB Markov RBPF Runnalls
 """
 
 
