@@ -69,6 +69,16 @@ def test_real_logs_are_left_in_peace(data, name):
     assert len(distrusted(log)) <= 0.005 * log.fixed.sum()
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_freezes_of_a_simulated_drive(seed):
+    _, log = simulate_drive(duration=600, seed=seed)
+    bad_log, bad = frozen(log, seed)
+    t_speed, speed = log.stream("speed_mps")
+    found, blamed = shares(bad_log, bad & log.fixed & (np.interp(log.t, t_speed, speed) > 1.0))
+    assert found >= 0.95
+    assert blamed <= 0.01 + bad.mean()  # what stands still while frozen counts as good here
+
+
 def test_jumps_of_a_simulated_drive():
     _, log = simulate_drive(duration=300, seed=3, tunnels=())
     rng = np.random.default_rng(0)

@@ -32,12 +32,18 @@ _STAY = (0.998, 0.9)
 #: Candidates for the deviation of a fix, m, and the intensity of the acceleration, m^2/s^3; rows to try them on.
 _FIX, _PUSH, _TRIED = (0.02, 0.05, 0.15, 0.5, 1.5, 5.0), (0.3, 1.0, 3.0, 10.0), 1500
 
+#: A log of more fixes is smoothed with a lag, to bound the memory.
+_WHOLE = 20_000
+
 #: A jump is garbage of this many standard deviations of a fix, and of this many metres at least.
 _WILD, _WILD_M = 100.0, 50.0
 
 #: A fix jumps if it lies this far from the smoothed path: in m, in standard deviations of a fix, and in what a car can
 #: have done between two fixes, m/s^2.
 _FAR_M, _FAR, _HARD = 5.0, 20.0, 5.0
+
+#: Fixes that stay away for longer are believed again, s.
+_LONGEST = 2.0
 
 #: How far a car must have moved for a repeat to be no standstill, m, and in steps of the log.
 _MOVED, _MOVED_STEPS = 0.05, 3.0
@@ -67,11 +73,6 @@ class Distrust:
     def of(self, why: str) -> NDArray[np.intp]:
         """Return the rows distrusted for one reason."""
         return np.asarray(self.rows[self.why == why])
-
-    def only(self, why: str) -> "Distrust":
-        """Return those distrusted for one reason."""
-        kept = self.why == why
-        return Distrust(self.rows[kept], self.why[kept], self.probability[kept])
 
     def masked(self, log: Log) -> Log:
         """Return the log without these fixes."""
@@ -104,12 +105,14 @@ class Distrust:
 NOTHING = Distrust(np.empty(0, dtype=np.intp), np.empty(0, dtype="<U6"), np.empty(0))
 
 
-def distrusted(log: Log) -> Distrust:
+def distrusted(log: Log, *, jumps: bool = True) -> Distrust:
     """Find fixes that are frozen or far off.
 
     Parameters
     ----------
     log : Log
+    jumps : bool
+        Whether to look for jumps; without it a log in which no fix repeats another costs nothing.
 
     Returns
     -------
@@ -120,13 +123,15 @@ def distrusted(log: Log) -> Distrust:
         return NOTHING
     east, north = evidence.local_metres(log.lat_deg[rows], log.lon_deg[rows])
     y, t = np.stack([east, north], axis=1), log.t[rows]
+    if not jumps and not _repeats(y).any():
+        return NOTHING
     step = _step(y)
     try:
         p, stale, far = _probabilities(t, y, step)
     except HalfwidthError:  # a log too strange for the model: nothing is held against it
         return NOTHING
     frozen = (stale > 0.5) & _repeats(y) & _moved(log, rows, y, step)
-    jump = (p < 0.5) & far & ~_repeats(y)
+    jump = _short((p < 0.5) & far & ~_repeats(y) & jumps, t)
     found = np.flatnonzero(frozen | jump)
     if found.size > 0.5 * rows.size:  # then the model is wrong, not the receiver
         return NOTHING
@@ -178,7 +183,7 @@ def _probabilities(t: Floats, y: Floats, step: Floats) -> tuple[Floats, Floats, 
             if loglik is not None and loglik > most:
                 best, most = (fix, push), loglik
     model, record = _model(t, y, step, *best)
-    est = GPB(2, lag=10).run(model, record)
+    est = (GPB(2, smooth=True) if t.size <= _WHOLE else GPB(2, lag=5)).run(model, record)
     assert est.gamma is not None
     far = np.hypot(*(y - est.x[:, [0, 2]]).T) > max(_FAR_M, _FAR * best[0], _HARD * float(np.median(np.diff(t))) ** 2)
     return est.gamma, est.info["lost_as"]["stale"], far
@@ -206,6 +211,16 @@ def _moved(log: Log, rows: NDArray[np.intp], y: Floats, step: Floats) -> NDArray
     else:
         away = np.where(last > first, away, 0.0)
     return np.asarray((away > least)[run])
+
+
+def _short(flagged: NDArray[np.bool_], t: Floats) -> NDArray[np.bool_]:
+    """Return flags without the runs that last too long for a jump: then the path is where these fixes say."""
+    edge = np.diff(np.concatenate(([0], flagged.astype(np.int8), [0])))
+    out = flagged.copy()
+    for a, b in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True):
+        if t[b - 1] - t[a] > _LONGEST:
+            out[a:b] = False
+    return out
 
 
 def _spans(t: Floats, rows: NDArray[np.intp], fixed: NDArray[np.intp]) -> list[tuple[float, float]]:

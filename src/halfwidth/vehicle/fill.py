@@ -100,7 +100,7 @@ def fill(
         raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
     messages: list[str] = []
     if distrust:
-        doubtful = distrusted(drive_log).only("frozen")  # stray ones show against speed and yaw rate, later
+        doubtful = distrusted(drive_log, jumps=False)  # stray ones show against speed and yaw rate, later
         messages.extend(doubtful.words(drive_log))
         drive_log = doubtful.masked(drive_log)
     drive_log = _with_pauses_filled(drive_log, messages)
