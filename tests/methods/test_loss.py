@@ -360,6 +360,15 @@ def test_own_noise_of_lost_samples_matters():
     assert np.sqrt(np.mean(np.square(errors["right"]))) < np.sqrt(np.mean(np.square(errors["wrong"])))
 
 
+def test_each_kind_may_have_its_own_noise():
+    law = hw.Bernoulli(0.7, kind=("stale", "garbage"), noise={"garbage": [4.0, 9.0]})
+    R = np.diag([1.0, 2.0])
+    np.testing.assert_allclose(law.cov("garbage", R), np.diag([4.0, 9.0]))
+    np.testing.assert_allclose(law.cov("stale", R), 1e-6 * R)
+    with pytest.raises(hw.BadValue, match="mapping"):
+        hw.Bernoulli(0.7, kind="stale", noise={"noise": 1.0})
+
+
 def test_last_reported_skips_missing_entries():
     y = np.array([[1.0], [np.nan], [3.0], [4.0]])
     np.testing.assert_array_equal(last_reported(y, ~np.isnan(y)), [[np.nan], [1.0], [1.0], [3.0]])

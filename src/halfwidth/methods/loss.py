@@ -323,8 +323,8 @@ class BKF2(_LossMethod):
 class GPB(_LossMethod):
     """Generalised pseudo-Bayes: one component for each of the last `depth` losses, partners merged by moments.
 
-    ``2**depth`` components; exact for the first ``depth + 1`` rows, close to exact from depth 3 on (the README of
-    ``benchmarks/losses.py`` prints how close). Depth 0 is `BKF2`, depth 1 is what the literature calls GPB2.
+    ``2**depth`` components; exact for the first ``depth + 1`` rows, close to exact from depth 3 on (``halfwidth
+    reproduce 001`` prints how close). Depth 0 is `BKF2`, depth 1 is what the literature calls GPB2.
 
     Parameters
     ----------
