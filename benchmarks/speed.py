@@ -1,6 +1,6 @@
 """Speed beside the peers and beside a hand-written C++ loop.
 
-    python benchmarks/speed.py [kalman] [many] [stream] [learn] [growth]
+    python benchmarks/speed.py [kalman] [many] [stream] [learn] [growth] [losses]
 
 Without arguments everything runs. Outputs are compared before anything is timed. Times are CPU times of this process,
 the minimum of repeats, except where wall time is said; a ratio divides two times taken in turns in the same process. A
@@ -339,8 +339,16 @@ def growth():
     )
 
 
+def losses():
+    """Filters for unknown losses beside filterpy's IMM and `particles`."""
+    sys.path.insert(0, str(HERE))
+    from losses import main as run
+
+    run()
+
+
 PARTS = {"kalman": (kalman, growth, many, stream, learn)}
-PARTS |= {part.__name__: (part,) for part in (growth, many, stream, learn)}
+PARTS |= {part.__name__: (part,) for part in (growth, many, stream, learn, losses)}
 
 
 def main():

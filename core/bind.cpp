@@ -8,6 +8,7 @@ namespace nb = nanobind;
 void bind_kalman(nb::module_& m);
 void bind_tape(nb::module_& m);
 void bind_nonlinear(nb::module_& m);
+void bind_loss(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -18,4 +19,5 @@ NB_MODULE(_core, m) {
     bind_kalman(m);
     bind_tape(m);
     bind_nonlinear(m);
+    bind_loss(m);
 }

@@ -6,10 +6,10 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BadLog BadRecord BadShape BadValue BatchLP Box Cloud DataQualityWarning Estimate Estimator ExtendedKalman Gaussian
-HalfwidthError KalmanFilter KalmanSmoother Learned Linear LogTooBig Missing Mixed Nonlinear Normal ParticleFilter
-Record Recursive Refused Status Uniform UnscentedKalman Unsolved __version__ estimate forecast from_continuous learn
-resume score simulate stream
+BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud DataQualityWarning Estimate
+Estimator ExtendedKalman FearnheadClifford GPB Gaussian HalfwidthError KalmanFilter KalmanSmoother Learned Linear
+LogTooBig Markov Missing Mixed Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls Status Uniform
+UnscentedKalman Unsolved __version__ estimate forecast from_continuous learn resume score simulate stream
 """
 
 

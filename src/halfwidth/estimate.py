@@ -17,6 +17,7 @@ from halfwidth.result import Estimate
 DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("KalmanSmoother", {}),
     ("UnscentedKalman", {"smooth": True}),
+    ("GPB", {"depth": 5, "smooth": True}),
     ("BatchLP", {}),
     ("ParticleFilter", {}),
 )

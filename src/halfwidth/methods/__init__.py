@@ -10,6 +10,13 @@ ESTIMATORS: dict[str, str] = {
     "ExtendedKalman": "nonlinear",
     "UnscentedKalman": "nonlinear",
     "ParticleFilter": "particle",
+    "BKF1": "loss",
+    "BKF2": "loss",
+    "GPB": "loss",
+    "RBPF": "loss",
+    "FearnheadClifford": "loss",
+    "Runnalls": "loss",
+    "BeamSearch": "loss",
     "BatchLP": "map",
 }
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle import calibrate, chain
+from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, usable
 from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.grid import Grid, sampled
@@ -57,6 +58,7 @@ def fill(
     method: str | None = None,
     level: float = 0.9,
     clock_offset: float | None = None,
+    distrust: bool = True,
 ) -> Track:
     """Fill the gaps of a log.
 
@@ -72,6 +74,9 @@ def fill(
     clock_offset : float, optional
         Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; 0 if
         absent.
+    distrust : bool
+        Whether fixes that only repeat the one before while the car moves are found and bridged; the track's messages
+        name them.
 
     Returns
     -------
@@ -94,6 +99,10 @@ def fill(
     if not drive_log.fixed.any():
         raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
     messages: list[str] = []
+    if distrust:
+        doubtful = distrusted(drive_log, jumps=False)  # stray ones show against speed and yaw rate, later
+        messages.extend(doubtful.words(drive_log))
+        drive_log = doubtful.masked(drive_log)
     drive_log = _with_pauses_filled(drive_log, messages)
     offset = 0.0 if clock_offset is None else float(clock_offset)
     grid = sampled(drive_log, clock_offset=offset)

@@ -252,7 +252,9 @@ class Log:
         more = np.atleast_1d(np.asarray(times, dtype=np.float64))
         t = np.concatenate((self.t, more))
         order = np.argsort(t, kind="stable")
-        streams = {name: np.concatenate((getattr(self, name), np.full(more.size, np.nan)))[order] for name in STREAMS}
+        streams: dict[str, Any] = {
+            name: np.concatenate((getattr(self, name), np.full(more.size, np.nan)))[order] for name in STREAMS
+        }
         return replace(self, t=t[order], **streams)
 
     def rates(self) -> dict[str, float | None]:
