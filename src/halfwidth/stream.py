@@ -152,18 +152,21 @@ def resume(snapshot: bytes, model: Model | None = None) -> Stream:
     if zlib.crc32(data[:-4]) != int.from_bytes(data[-4:], "little"):
         raise BadValue("`snapshot` is damaged: its check sum is wrong")
     size = int.from_bytes(data[12:20], "little")
-    head = json.loads(data[20 : 20 + size])
-    name, settings = head["method"]
+    try:
+        head = json.loads(data[20 : 20 + size])
+        name, settings = head["method"]
+        held, sizes = head["model"], head["sizes"]
+    except (ValueError, KeyError, TypeError):
+        raise BadValue("`snapshot` is not one of a stream: its head cannot be read") from None
     if name not in methods.ESTIMATORS:
         raise BadValue(f"`snapshot` is of `{name}`, which this version does not have")
     if model is None:
-        if head["model"] is None:
+        if held is None:
             raise BadValue("`snapshot` does not hold its model", hint="resume(snapshot, model)")
-        model = _model_from_json(head["model"])
-    if [model.nx, model.ny, model.nu] != head["sizes"]:
+        model = _model_from_json(held)
+    if [model.nx, model.ny, model.nu] != sizes:
         raise BadValue(
-            f"`snapshot` is of a model with nx, ny, nu = {head['sizes']},"
-            f" but `model` has {[model.nx, model.ny, model.nu]}"
+            f"`snapshot` is of a model with nx, ny, nu = {sizes}, but `model` has {[model.nx, model.ny, model.nu]}"
         )
     live = stream(model, methods.load(name)(**settings))
     try:
