@@ -5,10 +5,13 @@
 
 namespace nb = nanobind;
 
+void bind_lp(nb::module_& m);
+
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
     m.def("isa", [] { return hw::isa() == hw::Isa::avx2 ? "avx2" : "base"; },
           "The instruction set the kernels run with: \"avx2\" or \"base\".");
     m.def("use_isa", [](bool avx2) { return hw::use_isa(avx2 ? hw::Isa::avx2 : hw::Isa::base); }, nb::arg("avx2"),
           "Run the kernels with AVX2 or without; False if this machine cannot. For tests.");
+    bind_lp(m);
 }

@@ -1,0 +1,10 @@
+// Entry points of the structured linear program (core/banded_ipm.hpp), one per instruction set.
+#pragma once
+
+#include "isa.hpp"
+#include "lp_types.hpp"
+
+// bytes of workspace `lp_solve` needs, 64-byte aligned
+HW_KERNEL(std::size_t, lp_workspace, const LpProblem& lp, const LpSettings& set)
+// returns LpStatus; nothing is allocated
+HW_KERNEL(int, lp_solve, const LpProblem& lp, const LpSettings& set, LpOut& out, void* workspace)
