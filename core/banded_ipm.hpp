@@ -62,7 +62,7 @@ struct BandedIpm {
     bool boxed, soft, unit_E, capped;
 
     // the problem in scaled units, lane by lane; a stride of 0 marks a constant matrix
-    V *E, *A, *C, *Gt, *b, *base, *xlo, *xhi;
+    V *E, *Ed, *A, *C, *Gt, *b, *base, *xlo, *xhi;
     I dE, dA, dC;
     // iterate, directions, the reference that b is relative to, the best iterate so far
     V *x, *w, *l, *u, *v, *dx, *xref, *xbest, *lbest, *wbest;
@@ -99,6 +99,7 @@ struct BandedIpm {
     void carve(Carver& c) {
         const I h = H, nn = I(n) * n;
         E = unit_E ? nullptr : c.take<V>(dE ? h * nn : nn);
+        Ed = c.take<V>(n);  // E's diagonal, scaled
         A = c.take<V>(dA ? h * nn : nn);
         C = c.take<V>((dC ? h : 1) * m * n);
         Gt = c.take<V>(h * rows * p0);
@@ -139,10 +140,9 @@ struct BandedIpm {
     inline void apply(I i, const V* xi, const V* xb, const V* th, V* out) const {
         const V *Ei = unit_E ? nullptr : E + i * dE, *Ai = A + i * dA, *Ci = C + i * dC;
         for (int j = 0; j < n; j++) {
-            V s = xi[j];
+            V s = Ed[j] * xi[j];
             if (!unit_E)
                 for (int k = j + 1; k < n; k++) s += Ei[j * n + k] * xi[k];
-            if (!unit_E) s += (Ei[j * n + j] - V(1.0)) * xi[j];
             for (int k = 0; k < n; k++) s -= Ai[j * n + k] * xb[k];
             out[j] = s;
         }
@@ -165,9 +165,9 @@ struct BandedIpm {
     inline void adjoint(I i, const V* nu_, V* own_, V* bef_, bool theta) {
         const V *Ei = unit_E ? nullptr : E + i * dE, *Ai = A + i * dA, *Ci = C + i * dC;
         for (int k = 0; k < n; k++) {
-            V s = unit_E ? nu_[k] : V(0.0), t = V(0.0);
+            V s = Ed[k] * nu_[k], t = V(0.0);
             if (!unit_E)
-                for (int j = 0; j <= k; j++) s += Ei[j * n + k] * nu_[j];
+                for (int j = 0; j < k; j++) s += Ei[j * n + k] * nu_[j];
             for (int j = 0; j < n; j++) t -= Ai[j * n + k] * nu_[j];
             for (int j = 0; j < m; j++) s += Ci[j * n + k] * nu_[n + j];
             if (boxed) s += nu_[rows + k];
@@ -278,7 +278,7 @@ struct BandedIpm {
             for (int c = 0; c <= r; c++) {
                 V s = r == c ? base[i * n + r] + V(reg) : V(0.0), t(0.0);
                 if (unit_E) {
-                    if (r == c) s += W[r];
+                    if (r == c) s += W[r] * Ed[r] * Ed[r];
                 } else {
                     for (int j = 0; j <= c; j++) s += W[j] * Ei[j * n + r] * Ei[j * n + c];
                 }
@@ -291,7 +291,7 @@ struct BandedIpm {
         for (int r = 0; r < n; r++)
             for (int c = 0; c < n; c++) {
                 V s(0.0);
-                if (unit_E) s -= W[r] * Ai[r * n + c];
+                if (unit_E) s -= Ed[r] * W[r] * Ai[r * n + c];
                 else
                     for (int j = 0; j <= r; j++) s -= Ei[j * n + r] * W[j] * Ai[j * n + c];
                 Oi[r * n + c] = s;
@@ -303,7 +303,7 @@ struct BandedIpm {
                 const V wg = W[j] * g[j * p0 + c];
                 for (int k = 0; k < n; k++) {
                     if (j >= n) B[c * n + k] += Ci[(j - n) * n + k] * wg;
-                    else if (unit_E) B[c * n + k] += j == k ? wg : V(0.0);
+                    else if (unit_E) B[c * n + k] += j == k ? Ed[k] * wg : V(0.0);
                     else B[c * n + k] += Ei[j * n + k] * wg;
                     if (j < n) Bb[c * n + k] -= Ai[j * n + k] * wg;
                 }
@@ -314,7 +314,7 @@ struct BandedIpm {
             const int s = p0 + lp.group[j];
             for (int k = 0; k < n; k++) {
                 if (unit_E) {
-                    if (k == j) B[s * n + k] += Sg[j];
+                    if (k == j) B[s * n + k] += Ed[k] * Sg[j];
                 } else {
                     B[s * n + k] += Ei[j * n + k] * Sg[j];
                 }
@@ -457,6 +457,7 @@ struct BandedIpm {
                     for (int j = 0; j < n; j++) e += square(kappa[j] * lp.E[(I(t) * n + j) * n + k]);
             const double norm = a / TA + c / TC + (unit_E ? e : e / TE);
             sx[k] = norm > 1e-280 && norm < 1e280 ? 1.0 / std::sqrt(norm) : 1.0;
+            Ed[k] = V(kappa[k] * sx[k]);
         }
         for (int c = 0; c < p0; c++) {
             double s = 0.0;
