@@ -65,14 +65,14 @@ struct BandedIpm {
     V *E, *Ed, *A, *C, *Gt, *b, *base, *xlo, *xhi;
     I dE, dA, dC;
     // iterate, directions, the reference that b is relative to, the best iterate so far
-    V *x, *w, *l, *u, *v, *dx, *xref, *xbest, *lbest, *wbest;
+    V *x, *w, *l, *u, *v, *dx, *px, *xref, *xbest, *lbest, *wbest;
     // factor and right-hand side
     V *L, *O, *Z, *f, *Q, *K, *acc, *zacc;
     // one state's worth of scratch
     V *W, *Sg, *Ws, *nu, *rho, *own, *bef, *bef0, *back, *back0, *Bb, *Bb0, *wk, *dres, *lz, *left, *dzv;
     // the dense end: z = (theta, s), its bounds as pairs, its Schur complement, the chain of separators
     double *sx, *kappa, *cz, *sz, *z, *dz, *zref, *kz, *zbest, *zlo, *zhi, *zw, *zl, *zu, *zv, *zrp, *zlbest;
-    double *Kd, *KL, *Kpiv, *Kinv, *rM, *rO, *rZ, *rQ, *rf, *rx, *racc, *rw, *hmax, *count;
+    double *Kd, *KL, *Kpiv, *Kinv, *Korig, *zcg, *pz, *rM, *rO, *rZ, *rQ, *rf, *rx, *racc, *rw, *hmax, *count;
     double S, reg, drop, mu_pairs;
     double objective, comp, dinf, pinf, dual;  // of the current iterate, set by `assemble`
 
@@ -107,7 +107,7 @@ struct BandedIpm {
         base = c.take<V>(h * n);
         xlo = c.take<V>(boxed ? h * n : 0);
         xhi = c.take<V>(boxed ? h * n : 0);
-        c.many(h * n, x, dx, xref, xbest, f);
+        c.many(h * n, x, dx, xref, xbest, f, px);
         c.many(h * pw, w, l, u, v, lbest);
         wbest = c.take<V>(soft ? h * pw : 0);
         L = c.take<V>(h * nn);
@@ -124,7 +124,7 @@ struct BandedIpm {
         wk = c.take<V>(2 * n);
         sx = c.take<double>(n);
         c.many(rows, kappa, hmax, count);
-        c.many(p, cz, sz, z, dz, zref, kz, zbest, zlo, zhi, Kpiv, Kinv, racc);
+        c.many(p, cz, sz, z, dz, zref, kz, zbest, zlo, zhi, Kpiv, Kinv, racc, Korig, zcg, pz);
         c.many(2 * p, zw, zl, zu, zv, zrp, zlbest);
         c.many(I(p) * p, Kd, KL);
         c.many(P * nn, rM, rO);
@@ -353,13 +353,32 @@ struct BandedIpm {
             for (int d = 0; d <= c; d++) {
                 double s = sum_lanes(K[c * pc + d] - Q[tri(n + c, n + d)]) - rQ[tri(c, d)];
                 if (c == d) {
+                    Korig[c] = sum_lanes(K[c * pc + c]);
                     s += reg;
                     if (pc == p) s += zl[2 * c] / zw[2 * c] + zl[2 * c + 1] / zw[2 * c + 1];
                     if (zhi[c] == zlo[c]) s += lp_pinned;
                 }
                 Kd[c * pc + d] = Kd[d * pc + c] = s;
             }
-        ldl(Dim<0>(pc), Kd, KL, Kpiv, Kinv);
+        dense_factor();
+    }
+
+    // Kd = L D L' of the corner. A pivot lost to rounding is held at what rounding leaves of its diagonal entry: its
+    // half-width then moves too little, never too far.
+    void dense_factor() {
+        const double tiny = 1e-15;
+        for (int j = 0; j < pc; j++) {
+            double d = Kd[j * pc + j];
+            for (int k = 0; k < j; k++) d -= KL[j * pc + k] * KL[j * pc + k] * Kpiv[k];
+            d = max2(d, tiny * std::fabs(Korig[j]));
+            Kpiv[j] = d;
+            Kinv[j] = 1.0 / d;
+            for (int i = j + 1; i < pc; i++) {
+                double s = Kd[i * pc + j];
+                for (int k = 0; k < j; k++) s -= KL[i * pc + k] * KL[j * pc + k] * Kpiv[k];
+                KL[i * pc + j] = s * Kinv[j];
+            }
+        }
     }
 
     // ---- right-hand sides -----------------------------------------------------------------------------------------
@@ -559,18 +578,34 @@ struct BandedIpm {
         assemble(0, 0, false, false);
         forward([&](I i, int j, V& nu_, V&) { nu_ = j < rows ? -b[i * rows + j] : V(0.0); });
         backward(false, dx, dz, [](I, const V*, const V*) {});
-        pc = p;
         recentre();
+        // The factor carries a small ridge; where the fit is near perfect the ridge is what is left of it: solve again.
+        for (int k = 0; k < 3 && largest_residual() < 1e-4 * data_scale(); k++) {
+            forward([&](I i, int j, V& nu_, V&) { nu_ = j < rows ? -b[i * rows + j] : V(0.0); });
+            backward(false, dx, dz, [](I, const V*, const V*) {});
+            recentre();
+        }
+        pc = p;
+    }
+
+    double largest_residual() const {
+        V top(0.0);
+        for (I k = 0; k < I(H) * rows; k++) top = larger(top, magnitude(b[k]));
+        return max_lanes(top);
+    }
+
+    // what rounding is relative to: the largest state in scaled units
+    double data_scale() const {
+        V top(0.0);
+        for (I k = 0; k < I(H) * n; k++) top = larger(top, magnitude(xref[k]));
+        return max_lanes(top);
     }
 
     // A point strictly inside: least squares pushed into the boxes, half-widths above every residual. False if all
     // residuals there are rounding: nothing is left to minimise.
     bool start() {
-        double biggest = 0.0;  // of the data, in scaled units: what rounding is relative to
-        V big(0.0);
         for (I i = 0; i < H; i++) {
             for (int k = 0; k < n; k++) {
-                big = larger(big, magnitude(xref[i * n + k]));
                 V d(0.0);
                 if (boxed) {
                     const V lo = xlo[i * n + k] - xref[i * n + k], hi = xhi[i * n + k] - xref[i * n + k];
@@ -579,7 +614,7 @@ struct BandedIpm {
                 dx[i * n + k] = d;
             }
         }
-        biggest = max_lanes(big);
+        const double biggest = data_scale();
         for (int c = 0; c < p0; c++) dz[c] = zhi[c] == zlo[c] ? 0.0 : inside(zlo[c] - zref[c], zhi[c] - zref[c], 0.0);
         for (int c = 0; c < p0; c++) z[c] = 0.0;
         if (boxed || p0) recentre();
@@ -596,7 +631,7 @@ struct BandedIpm {
         }
         S = max_lanes(top);
         objective = comp = 0.0;
-        if (!(S > 1e-14 * biggest) || S < 1e-290) return false;
+        if (!(S > 1e-12 * biggest) || S < 1e-290) return false;
         const V over(1.0 / S);
         for (I i = 0; i < H; i++) {
             for (int j = 0; j < rows; j++) b[i * rows + j] *= over;
@@ -857,40 +892,83 @@ struct BandedIpm {
         bd = larger(bd, -vn);
     }
 
-    // One step of iterative refinement: after a full step the dual equations should hold; solve for what is missing.
-    void refine(double& block_p_, double& block_d_) {
-        forward([&](I i, int j, V& nu_, V& t) {
-            const V *li = l + i * pw + 2 * j, *vi = v + i * pw + 2 * j;
-            const V a = li[0] + li[0] * vi[0], c = li[1] + li[1] * vi[1];
-            nu_ = a - c;
-            t = a + c;
-        });
-        for (int k = 0; k < 2 * p; k++) kz[k / 2] += (k & 1 ? -1.0 : 1.0) * (zl[k] + zl[k] * zv[k]);
+    // After a full step the dual equations should hold; what is missing is solved for by conjugate gradients on the
+    // unfactored matrix, with the factor (which carries the ridge and its own rounding) as preconditioner.
+    void refine(int steps, double& block_p_, double& block_d_) {
+        double before = 0.0;
+        for (int step = 0; step < steps; step++) {
+            forward([&](I i, int j, V& nu_, V& t) {
+                const V *li = l + i * pw + 2 * j, *vi = v + i * pw + 2 * j;
+                const V a = li[0] + li[0] * vi[0], c = li[1] + li[1] * vi[1];
+                nu_ = a - c;
+                t = a + c;
+            });
+            for (int k = 0; k < 2 * p; k++) kz[k / 2] += (k & 1 ? -1.0 : 1.0) * (zl[k] + zl[k] * zv[k]);
+            const double now = preconditioned_norm();
+            if (!(now > 0.0) || now > 1e200) return;
+            const double beta = step ? now / before : 0.0;
+            before = now;
+            V energy(0.0);
+            backward(false, f, zcg, [](I, const V*, const V*) {});
+            for (int c = 0; c < p; c++) {
+                pz[c] = step ? zcg[c] + beta * pz[c] : zcg[c];
+                dzv[c] = V(pz[c]);
+            }
+            for (I k = 0; k < I(H) * n; k++) px[k] = step ? f[k] + V(beta) * px[k] : f[k];
+            for (int k = 0; k < n; k++) left[k] = from_before(px[(H - 1) * n + k]);
+            for (I i = 0; i < H; i++) {
+                const V *wi = w + i * pw, *li = l + i * pw;
+                apply(i, px + i * n, i ? px + (i - 1) * n : left, p0 ? dzv : nullptr, rho);
+                for (int j = 0; j < G; j++) {
+                    const V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
+                    V Wj, Sj, Wsj;
+                    weigh(wi, li, j, Wj, Sj, Wsj);
+                    energy += Wj * rho[j] * rho[j] + V(2.0) * Sj * rho[j] * ds + Wsj * ds * ds;
+                }
+            }
+            double e = sum_lanes(energy);
+            for (int c = 0; c < p; c++) e += pz[c] * pz[c] * (zl[2 * c] / zw[2 * c] + zl[2 * c + 1] / zw[2 * c + 1]);
+            const double gamma = now / e;
+            if (!(gamma > 0.0) || gamma > 1e12) return;
+            amend(gamma, block_p_, block_d_);
+        }
+    }
+
+    // (u, v) and (dx, dz) take gamma times (px, pz)
+    void amend(double gamma, double& block_p_, double& block_d_) {
         V block_p(0.0), block_d(0.0);
-        backward(false, f, zbuf(), [&](I i, const V* xi, const V* xb) {
+        const V g(gamma);
+        for (I i = 0; i < H; i++) {
             V *wi = w + i * pw, *li = l + i * pw, *ui = u + i * pw, *vi = v + i * pw;
-            apply(i, xi, xb, p0 ? dzv : nullptr, rho);
+            apply(i, px + i * n, i ? px + (i - 1) * n : left, p0 ? dzv : nullptr, rho);
+            auto take = [&](const V& dw, int k) {
+                const V du = where_positive(li[k], g * dw / wi[k], V(0.0));
+                ui[k] += du;
+                vi[k] -= du;
+                block_p = larger(block_p, -ui[k]);
+                block_d = larger(block_d, -vi[k]);
+            };
             for (int j = 0; j < G; j++) {
                 V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
                 if (soft && j < rows) {
                     V Wd, Sd, den;
                     const V de = slack_step(wi, li, j, V(0.0), ds, rho[j], Wd, Sd, den);
-                    amend(de, wi, li, ui, vi, 2 * G + j, block_p, block_d);
+                    take(de, 2 * G + j);
                     ds += de;
                 }
-                amend(ds - rho[j], wi, li, ui, vi, 2 * j, block_p, block_d);
-                amend(ds + rho[j], wi, li, ui, vi, 2 * j + 1, block_p, block_d);
+                take(ds - rho[j], 2 * j);
+                take(ds + rho[j], 2 * j + 1);
             }
-            for (int k = 0; k < n; k++) dx[i * n + k] += xi[k];
-        });
+            for (int k = 0; k < n; k++) dx[i * n + k] += g * px[i * n + k];
+        }
         block_p_ = max_lanes(block_p);
         block_d_ = max_lanes(block_d);
         for (int c = 0; c < p; c++) {
-            dz[c] += zbuf()[c];
+            dz[c] += gamma * pz[c];
             for (int side = 0; side < 2; side++) {
                 const int k = 2 * c + side;
                 if (!(zl[k] > 0)) continue;
-                const double du = (side ? -zbuf()[c] : zbuf()[c]) / zw[k];
+                const double du = gamma * (side ? -pz[c] : pz[c]) / zw[k];
                 zu[k] += du;
                 zv[k] -= du;
                 block_p_ = max2(block_p_, -zu[k]);
@@ -898,14 +976,20 @@ struct BandedIpm {
             }
         }
     }
-    inline double* zbuf() { return Kpiv; }  // pivots are not needed once their reciprocals are known
 
-    inline void amend(const V& dw, const V* wi, const V* li, V* ui, V* vi, int k, V& bp, V& bd) const {
-        const V du = where_positive(li[k], dw / wi[k], V(0.0));
-        ui[k] += du;
-        vi[k] -= du;
-        bp = larger(bp, -ui[k]);
-        bd = larger(bd, -vi[k]);
+    // r' M^-1 r of the right-hand side left by `forward`
+    double preconditioned_norm() {
+        const I nn = I(n) * n;
+        V s(0.0);
+        for (I i = 0; i + 1 < H; i++)
+            for (int k = 0; k < n; k++) s += f[i * n + k] * f[i * n + k] * L[i * nn + k * n + k];
+        double total = sum_lanes(s);
+        for (int t = 0; t < P; t++)
+            for (int k = 0; k < n; k++) total += square(rf[t * n + k]) * rM[t * nn + k * n + k];
+        for (int c = 0; c < p; c++) zcg[c] = kz[c];
+        ldl_solve(Dim<0>(p), Dim<1>(), KL, Kinv, zcg);
+        for (int c = 0; c < p; c++) total += kz[c] * zcg[c];
+        return total;
     }
 
     void dense_take(double ap, double ad) {
@@ -991,13 +1075,15 @@ struct BandedIpm {
             if (set.point == lp_central) sigma = max2(sigma, 0.2), fraction = 0.9;
             double bp, bd;
             corrected(sigma * mu, bp, bd);
-            const int steps = set.point == lp_central ? 0 : mu < 1e-7 * mu0 ? 2 : mu < 1e-4 * mu0 ? 1 : 0;
-            for (int k = 0; k < steps && k < set.refine; k++) refine(bp, bd);
+            const double need = dinf / size;
+            int steps = set.point == lp_central ? 0 : mu < 1e-7 * mu0 ? 2 : mu < 1e-4 * mu0 ? 1 : 0;
+            if (set.point != lp_central && need > set.tol && need > 0.1 * gap) steps += 2;
+            refine(steps, bp, bd);
             ap = min2(1.0, fraction / max2(bp, 1e-300));
             ad = min2(1.0, fraction / max2(bd, 1e-300));
             if (!(bp - bp == 0.0) || !(bd - bd == 0.0)) break;
         }
-        const bool good = best <= set.tol, fair = best <= 1e-6;
+        const bool good = best <= 10.0 * set.tol, fair = best <= 1e-6;
         info.status = good ? lp_ok : fair ? lp_reduced : lp_stalled;
         const int verdict = kept ? finish(out, xbest, lbest, zbest, false) : finish(out, x, l, z, false);
         if (verdict == lp_stalled) info.status = lp_stalled;
