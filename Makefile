@@ -20,10 +20,10 @@ $(VENV)/.installed-%: $(BIN)/python $(SOURCES)
 demo: $(VENV)/.installed-app
 	$(BIN)/halfwidth demo
 
-test: $(VENV)/.installed-test
+test: $(VENV)/.installed-test,dev
 	$(BIN)/python -m pytest -n 2 --dist loadgroup tests
 
-check: $(VENV)/.installed-test $(VENV)/.installed-dev
+check: $(VENV)/.installed-test,dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy

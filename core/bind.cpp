@@ -5,6 +5,9 @@
 
 namespace nb = nanobind;
 
+void bind_kalman(nb::module_& m);
+void bind_tape(nb::module_& m);
+void bind_nonlinear(nb::module_& m);
 void bind_lp(nb::module_& m);
 
 NB_MODULE(_core, m) {
@@ -13,5 +16,8 @@ NB_MODULE(_core, m) {
           "The instruction set the kernels run with: \"avx2\" or \"base\".");
     m.def("use_isa", [](bool avx2) { return hw::use_isa(avx2 ? hw::Isa::avx2 : hw::Isa::base); }, nb::arg("avx2"),
           "Run the kernels with AVX2 or without; False if this machine cannot. For tests.");
+    bind_kalman(m);
+    bind_tape(m);
+    bind_nonlinear(m);
     bind_lp(m);
 }

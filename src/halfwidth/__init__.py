@@ -1,1 +1,111 @@
-"""State estimation for the real world: bounded noise, unknown half-widths, missing measurements."""
+"""State estimation for the real world: bounded noise, unknown half-widths, missing measurements.
+
+The model, everywhere: ``E x[t] = A x[t-1] + B u[t] + w[t]``,  ``F y[t] = C x[t] + e[t]``, for the rows t of a record;
+x0 is the state one step before the first row. Times are in seconds, angles in radians, everything else in the units of
+the user. NaN in y is a missing entry.
+
+`estimate(model, record, method)` is the one front door; every answer is an `Estimate` with a `Status`.
+"""
+
+import importlib
+import sys
+import types
+from typing import TYPE_CHECKING, Any
+
+from halfwidth.methods import ESTIMATORS
+
+__version__ = "0.1.0"
+
+#: Public names and the module of each, loaded when first used: importing the package stays fast.
+_HOME: dict[str, str] = {
+    "Uniform": "noise",
+    "Gaussian": "noise",
+    "Mixed": "noise",
+    "Box": "spread",
+    "Normal": "spread",
+    "Cloud": "spread",
+    "Linear": "model",
+    "Nonlinear": "model",
+    "Record": "record",
+    "Estimate": "result",
+    "Status": "result",
+    "from_continuous": "continuous",
+    "estimate": "estimate",
+    "simulate": "simulate",
+    "score": "score",
+    "stream": "stream",
+    "resume": "stream",
+    "forecast": "forecast",
+    "learn": "learn",
+    "Learned": "learn",
+    "HalfwidthError": "errors",
+    "BadShape": "errors",
+    "BadValue": "errors",
+    "BadRecord": "errors",
+    "BadLog": "errors",
+    "Refused": "errors",
+    "Missing": "errors",
+    "Unsolved": "errors",
+    "DataQualityWarning": "errors",
+    "Estimator": "methods._protocol",
+    "Recursive": "methods._protocol",
+} | {name: f"methods.{module}" for name, module in ESTIMATORS.items()}
+
+__all__ = ["__version__", *sorted(_HOME)]
+
+if TYPE_CHECKING:
+    from halfwidth.continuous import from_continuous as from_continuous
+    from halfwidth.errors import BadLog as BadLog
+    from halfwidth.errors import BadRecord as BadRecord
+    from halfwidth.errors import BadShape as BadShape
+    from halfwidth.errors import BadValue as BadValue
+    from halfwidth.errors import DataQualityWarning as DataQualityWarning
+    from halfwidth.errors import HalfwidthError as HalfwidthError
+    from halfwidth.errors import Missing as Missing
+    from halfwidth.errors import Refused as Refused
+    from halfwidth.errors import Unsolved as Unsolved
+    from halfwidth.estimate import estimate as estimate
+    from halfwidth.forecast import forecast as forecast
+    from halfwidth.learn import Learned as Learned
+    from halfwidth.learn import learn as learn
+    from halfwidth.methods._protocol import Estimator as Estimator
+    from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.model import Linear as Linear
+    from halfwidth.model import Nonlinear as Nonlinear
+    from halfwidth.noise import Gaussian as Gaussian
+    from halfwidth.noise import Mixed as Mixed
+    from halfwidth.noise import Uniform as Uniform
+    from halfwidth.record import Record as Record
+    from halfwidth.result import Estimate as Estimate
+    from halfwidth.result import Status as Status
+    from halfwidth.score import score as score
+    from halfwidth.simulate import simulate as simulate
+    from halfwidth.spread import Box as Box
+    from halfwidth.spread import Cloud as Cloud
+    from halfwidth.spread import Normal as Normal
+    from halfwidth.stream import resume as resume
+    from halfwidth.stream import stream as stream
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'halfwidth' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"halfwidth.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return list(__all__)
+
+
+class _Package(types.ModuleType):
+    """The package: a public function keeps its name although the module that holds it is called the same."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # The import system binds every submodule it loads to the package; `halfwidth.learn` must stay the function.
+        if not (name in _HOME and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,0 +1,103 @@
+"""Forecasts: the estimate of rows that are still missing.
+
+A record is extended by rows without outputs; whatever estimates the states of a gap estimates those rows too.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from halfwidth.array import Array
+from halfwidth.estimate import estimate
+from halfwidth.methods.kalman import matrices
+from halfwidth.model import Linear, Model
+from halfwidth.record import Record
+from halfwidth.result import Estimate
+from halfwidth.spread import Box, Cloud, Normal, Spread
+
+
+def forecast(
+    model: Model,
+    record: Record,
+    steps: int,
+    *,
+    u: ArrayLike | None = None,
+    dt: float | None = None,
+    method: Any = None,
+) -> Estimate:
+    """Estimate the states, and for a linear Gaussian model the outputs, of the rows after a record.
+
+    Parameters
+    ----------
+    model : Linear or Nonlinear
+    record : Record
+    steps : int
+        Number of rows ahead.
+    u : (steps, nu) array_like, optional
+        Inputs of those rows; needed if the model has inputs.
+    dt : float, optional
+        Step between them, s; the median step of the record if absent.
+    method : estimator, optional
+        As in `estimate`.
+
+    Returns
+    -------
+    Estimate
+        Of the new rows only; ``info["y"]`` (steps, ny) and ``info["S"]`` (steps, ny, ny) are mean and covariance of
+        their outputs where the spread is Gaussian and the model linear.
+
+    Raises
+    ------
+    BadValue, BadRecord
+        If `steps` is no whole number from 1 or inputs are absent.
+
+    Examples
+    --------
+    >>> import halfwidth as hw
+    >>> walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(1.0), hw.Gaussian(1.0), hw.Normal([0.0], 1.0))
+    >>> ahead = hw.forecast(walk, hw.Record([0.0, 1.0], [1.0, 2.0]), 2)
+    >>> ahead.P.ravel().round(3), ahead.info["S"].ravel().round(3)
+    (array([1.625, 2.625]), array([2.625, 3.625]))
+    """
+    longer = record.extended(steps, dt=dt, u=u)
+    est = estimate(model, longer, method)
+    s = slice(len(record), len(longer))
+    info: dict[str, Any] = {"message": est.message, "n_seen": int(record.seen.sum())}
+    P = est.P
+    if isinstance(model, Linear) and P is not None:
+        t, step = longer.t, longer.steps(model.dt)
+        m = matrices(model, t, step)
+        C, R = (_tail(stack, m.which.get(name), s) for stack, name in ((m.C, "iC"), (m.R, "iR")))
+        info["y"] = (C @ est.x[s][:, :, None])[:, :, 0]
+        info["S"] = C @ P[s] @ np.swapaxes(C, -1, -2) + R
+    return Estimate(
+        est.t[s],
+        est.x[s],
+        _part(est.spread, s),
+        est.status,
+        est.method,
+        q=est.q,
+        r=est.r,
+        theta=est.theta,
+        loglik=est.loglik,
+        names=est.names,
+        labels=longer.labels,
+        info=info,
+    )
+
+
+def _tail(stack: Array, which: Any, s: slice) -> Array:
+    if which is not None:
+        return np.asarray(stack[which[s]])
+    return np.asarray(stack[0] if len(stack) == 1 else stack[s])
+
+
+def _part(spread: Spread | None, s: slice) -> Spread | None:
+    if isinstance(spread, Normal):
+        return Normal.of(spread.mean[s], spread.P[s])
+    if isinstance(spread, Box):
+        return Box(spread.lo[s], spread.hi[s], guaranteed=spread.guaranteed)
+    if isinstance(spread, Cloud):
+        return Cloud(spread.points[s], spread.weights[s])
+    return None

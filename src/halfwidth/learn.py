@@ -1,0 +1,519 @@
+"""Learning a model from records with gaps: noise covariances Q, R, unknown entries of A, B, C, and the mean of x0.
+
+One pass of the smoother gives the expected sums of ``w w'``, ``e e'`` and their companions given all seen outputs,
+exact with any entry missing (core/kalman.hpp). Expectation maximisation (Shumway and Stoffer 1982, J. Time Series Anal.
+3(4)) turns the sums into the next model; maximum likelihood hands the gradient that they give by Fisher's identity,
+``d loglik / dQ = 1/2 Q^-1 (sum E w w' - n Q) Q^-1``, to a quasi-Newton search. Both climb the same likelihood.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from halfwidth import _core
+from halfwidth.array import Array
+from halfwidth.errors import BadRecord, BadValue, Refused, Unsolved, hinted
+from halfwidth.estimate import fits
+from halfwidth.methods.kalman import matrices, not_gaussian
+from halfwidth.model import Linear, Model
+from halfwidth.noise import Gaussian
+from halfwidth.record import Record
+from halfwidth.result import Status
+from halfwidth.spread import Normal
+from halfwidth.varying import Varying
+
+STRUCTURES = ("full", "diagonal", "scaled")
+PARTS = ("Q", "R", "A", "B", "C", "theta", "x0")
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """A model with what was learned in it.
+
+    Parameters
+    ----------
+    model : Linear
+    loglik : float
+        Log-likelihood of the seen outputs under `model`.
+    history : tuple of float
+        Log-likelihood before each iteration.
+    status : Status
+        ``OK`` if converged, ``STALLED`` if the iterations ran out.
+    info : mapping
+        ``message``, ``iterations``, ``n_seen``.
+    """
+
+    model: Linear
+    loglik: float
+    history: tuple[float, ...]
+    status: Status
+    info: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    def check(self) -> "Learned":
+        """Return the value itself.
+
+        Raises
+        ------
+        Unsolved
+            If the status is not good.
+        """
+        if not self.status.good:
+            raise Unsolved(f"Status.{self.status.name}: {self.info['message']}", hint="give more `iterations`")
+        return self
+
+    def __repr__(self) -> str:
+        return f"Learned(loglik={self.loglik:.6g}, {len(self.history)} iterations, status={self.status.name})"
+
+
+def learn(
+    model: Model,
+    record: Record | Sequence[Record],
+    *,
+    what: Sequence[str] = ("Q", "R"),
+    structure: Mapping[str, str] | None = None,
+    method: str = "em",
+    iterations: int = 500,
+    tolerance: float = 1e-8,
+) -> Learned:
+    """Learn parts of a linear Gaussian model from one or several records.
+
+    Parameters
+    ----------
+    model : Linear
+        Gaussian noise; the values of what is to be learned are where the search starts.
+    record : Record or sequence of Records
+    what : sequence of str
+        Some of ``"Q"``, ``"R"`` (covariances of w and e), ``"A"``, ``"B"``, ``"C"`` (whole constant matrices),
+        ``"theta"`` (their NaN entries, within ``model.theta_bounds``) and ``"x0"`` (the mean of the prior).
+    structure : mapping, optional
+        For the keys Q and R one of ``"full"``, ``"diagonal"`` and ``"scaled"`` (a multiple of what the model gives,
+        which may then vary with time or step); full if absent, scaled for a covariance that varies.
+    method : {"em", "ml"}
+        Expectation maximisation, or maximum likelihood (Q and R only), which needs fewer passes near the optimum.
+    iterations : int
+        At most so many.
+    tolerance : float
+        Converged when an iteration gains less than this share of the log-likelihood.
+
+    Returns
+    -------
+    Learned
+
+    Raises
+    ------
+    Refused
+        If the model is not linear and Gaussian.
+    BadValue, BadRecord
+        If an argument cannot be used or nothing was seen.
+
+    Examples
+    --------
+    >>> import halfwidth as hw
+    >>> walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(1.0), hw.Gaussian(4.0), hw.Normal([0.0], 1.0))
+    >>> _, record = hw.simulate(walk, T=500, seed=1)
+    >>> guess = hw.Linear([[1]], None, [[1]], hw.Gaussian(0.1), hw.Gaussian(0.1), walk.x0)
+    >>> hw.learn(guess, record).check().model.e.cov().single.round(0)
+    array([[4.]])
+    """
+    records = [record] if isinstance(record, Record) else list(record)
+    if not records or not all(isinstance(r, Record) for r in records):
+        raise BadRecord("`record` holds no Record, one or several were expected")
+    what = (what,) if isinstance(what, str) else tuple(what)
+    if not what or any(part not in PARTS for part in what):
+        raise BadValue(f"`what` is {what!r}, some of {', '.join(PARTS)} were expected")
+    if method not in ("em", "ml"):
+        raise BadValue(f"`method` is {method!r}, 'em' or 'ml' was expected")
+    if not isinstance(iterations, int) or iterations < 1:
+        raise BadValue(f"`iterations` is {iterations!r}, a whole number from 1 was expected")
+    if not tolerance > 0:
+        raise BadValue(f"`tolerance` is {tolerance!r}, a positive number was expected")
+    if not isinstance(model, Linear):
+        raise Refused("`learn` needs a linear model but this one is `Nonlinear`", hint="SequentialLP(...)")
+    free = _free(model, what)
+    start = _started(model, free)
+    reason = not_gaussian(start, "learn")
+    if reason is not None:
+        message, hint = hinted(reason)
+        raise Refused(message, hint=hint)
+    for one in records:
+        fits(start, one)
+    if not any(one.seen.any() for one in records):
+        raise BadRecord("no output of `record` was seen, so there is nothing to learn from")
+    problem = _Problem(model, start, records, what, free, _structures(start, what, free, structure))
+    if method == "em":
+        return problem.em(iterations, tolerance)
+    if set(what) - {"Q", "R"}:
+        raise BadValue(f"`method` is 'ml' but `what` is {what!r}, only Q and R were expected", hint="method='em'")
+    return problem.ml(iterations, tolerance)
+
+
+def _free(model: Linear, what: Sequence[str]) -> dict[str, Any]:
+    """Return the mask of the entries to learn of each matrix that has some."""
+    free = {}
+    for name, matrix in model.matrices.items():
+        unknown = np.zeros(matrix.shape, dtype=bool)
+        if matrix.value is not None and matrix.value.ndim == 2:
+            unknown = np.isnan(matrix.value)
+        whole = name in what
+        if name in ("E", "F") and unknown.any():
+            raise Refused(f"`learn` cannot find unknown entries of `{name}`", hint="give its entries")
+        if unknown.any() and not whole and "theta" not in what:
+            raise BadValue(
+                f"`{name}` has unknown entries (NaN) but `what` is {tuple(what)!r}", hint='what=("Q", "R", "theta")'
+            )
+        if whole and not matrix.constant:
+            raise BadValue(f"`{name}` varies with time, only a constant matrix can be learned")
+        if whole or unknown.any():
+            free[name] = np.ones(matrix.shape, dtype=bool) if whole else unknown
+    if "theta" in what and not model.theta_entries:
+        raise BadValue("`what` holds 'theta' but no entry of the model is unknown (NaN)")
+    if "B" in what and model.B is None:
+        raise BadValue("`what` holds 'B' but the model has no inputs")
+    return free
+
+
+def _started(model: Linear, free: Mapping[str, Any]) -> Linear:
+    """Return the model with unknown entries at the middle of their bounds, 0 without bounds."""
+    if not model.theta_entries:
+        return model
+    middle = np.zeros(len(model.theta_entries)) if model.theta_bounds is None else model.theta_bounds.mean
+    new = {name: model.matrices[name].single.copy() for name in free}
+    for entry, value in zip(model.theta_entries, middle, strict=True):
+        new[entry.matrix][entry.row, entry.column] = value
+    return dataclasses.replace(model, **new, theta_bounds=None)
+
+
+def _structures(
+    model: Linear, what: Sequence[str], free: Mapping[str, Any], given: Mapping[str, str] | None
+) -> dict[str, str]:
+    given = dict(given or {})
+    found = {}
+    for name, noise in (("Q", model.w), ("R", model.e)):
+        constant = noise.cov().constant
+        kind = given.pop(name, "full" if constant else "scaled")
+        if kind not in STRUCTURES:
+            raise BadValue(f"`structure` of {name} is {kind!r}, one of {', '.join(STRUCTURES)} was expected")
+        if name in what and kind != "scaled" and not constant:
+            raise BadValue(
+                f"`structure` of {name} is {kind!r} but {name} varies with time",
+                hint=f'structure={{"{name}": "scaled"}}',
+            )
+        found[name] = kind
+    if given:
+        raise BadValue(f"`structure` has the keys {sorted(given)}, Q and R were expected")
+    for name, noise, parts in (("Q", model.w, "AB"), ("R", model.e, "C")):
+        if set(parts) & set(free) and not noise.cov().constant:
+            raise Refused(
+                f"`learn` cannot learn {', '.join(sorted(set(parts) & set(free)))} while {name} varies with time"
+            )
+    for name, matrix in (("Q", model.E), ("R", model.F)):
+        if name in what and matrix is not None and not matrix.constant:
+            raise Refused(f"`learn` cannot learn {name} while `{matrix.name}` varies with time")
+    return found
+
+
+class _Problem:
+    """The records beside the current model; E-steps and the two searches."""
+
+    def __init__(
+        self,
+        asked: Linear,
+        model: Linear,
+        records: list[Record],
+        what: Sequence[str],
+        free: dict[str, Any],
+        kinds: dict[str, str],
+    ) -> None:
+        self.model, self.what, self.free, self.kinds = model, what, free, kinds
+        self.entries, self.bounds = asked.theta_entries, asked.theta_bounds
+        self.lengths = [len(r) for r in records]
+        self.t = np.concatenate([r.t for r in records])
+        self.dt = np.concatenate([r.steps(model.dt) for r in records])
+        self.y = np.concatenate([r.y for r in records])
+        self.seen = np.concatenate([r.seen for r in records])
+        self.u = np.concatenate([r.u for r in records if r.u is not None]) if model.nu else None
+        self.offsets = np.concatenate(([0], np.cumsum(self.lengths)))
+        self.E = np.eye(model.nx) if model.E is None or not model.E.constant else model.E.single
+        self.F = np.eye(model.ny) if model.F is None or not model.F.constant else model.F.single
+
+    def expect(self, model: Linear) -> dict[str, Any]:
+        """One smoothing pass: the log-likelihood and the expected sums, E and F taken out again."""
+        m = matrices(model, self.t, self.dt, self.lengths)
+        x0 = model.x0
+        assert isinstance(x0, Normal)
+        more = {} if self.u is None else {"u": self.u}
+        out: dict[str, Any] = _core.kalman_run(
+            "smooth",
+            m.A,
+            m.B if model.nu else None,
+            m.C,
+            m.Q,
+            m.R,
+            self.y,
+            self.seen,
+            np.ascontiguousarray(x0.mean),
+            np.ascontiguousarray(x0.P),
+            offsets=self.offsets,
+            initial=True,
+            sums=True,
+            **more,
+            **m.which,
+        )
+        E, F = self.E, self.F
+        out["loglik"] = float(out["loglik"].sum())
+        for name in ("W", "Wx", "Wu"):
+            out[name] = E @ out[name]
+        out["W"] = out["W"] @ E.T
+        for name in ("V", "Vx"):
+            out[name] = F @ out[name]
+        out["V"] = out["V"] @ F.T
+        out["ok"] = max(out["code"]) < 3
+        return out
+
+    # -- expectation maximisation --------------------------------------------------------------------------------------
+
+    def em(self, iterations: int, tolerance: float, model: Linear | None = None) -> Learned:
+        """Alternate smoothing passes and closed-form updates."""
+        model = self.model if model is None else model
+        history: list[float] = []
+        status, message = Status.STALLED, f"the likelihood still rose after {iterations} iterations"
+        best = model
+        found = self.expect(model)
+        while len(history) < iterations:
+            if not found["ok"]:
+                status, message = Status.COLLAPSED, "the smoother left the range of floating point"
+                break
+            gain = found["loglik"] - history[-1] if history else np.inf
+            history.append(found["loglik"])
+            best = model
+            if abs(gain) <= tolerance * max(1.0, abs(found["loglik"])):
+                status, message = Status.OK, f"converged after {len(history)} iterations"
+                break
+            model = self.maximise(model, found)
+            found = self.expect(model)
+        if found["ok"] and (not history or found["loglik"] >= history[-1]):
+            best = model
+        loglik = max(found["loglik"], history[-1]) if found["ok"] else history[-1] if history else float("-inf")
+        info = {"message": message, "iterations": len(history), "n_seen": int(self.seen.sum())}
+        return Learned(best, loglik, tuple(history), status, info)
+
+    def maximise(self, model: Linear, s: dict[str, Any]) -> Linear:
+        """Return the next model from the expected sums."""
+        new: dict[str, Any] = {}
+        W, V = s["W"], s["V"]
+        Q, R = model.w.cov(), model.e.cov()
+        if "A" in self.free or "B" in self.free:
+            Wz = np.hstack((s["Wx"], s["Wu"]))
+            Z = np.block([[s["Xx"], s["Xu"]], [s["Xu"].T, s["Uu"]]])
+            nx, nu = model.nx, model.nu
+            mask = np.zeros((nx, nx + nu), dtype=bool)
+            mask[:, :nx] = self.free.get("A", False)
+            if nu:
+                mask[:, nx:] = self.free.get("B", False)
+            lo, hi = self.room("A", model.A.single), self.room("B", None if model.B is None else model.B.single)
+            step = _regression(Wz, Z, Q.single, mask, *(np.hstack(side) for side in zip(lo, hi, strict=True)))
+            W = W - step @ Wz.T - Wz @ step.T + step @ Z @ step.T
+            if "A" in self.free:
+                new["A"] = model.A.single + step[:, :nx]
+            if "B" in self.free and model.B is not None:
+                new["B"] = model.B.single + step[:, nx:]
+        if "C" in self.free:
+            step = _regression(s["Vx"], s["Xy"], R.single, self.free["C"], *self.room("C", model.C.single))
+            V = V - step @ s["Vx"].T - s["Vx"] @ step.T + step @ s["Xy"] @ step.T
+            new["C"] = model.C.single + step
+        if "Q" in self.what:
+            new["w"] = Gaussian(self.covariance("Q", Q, W, s["nW"]))
+        if "R" in self.what:
+            new["e"] = Gaussian(self.covariance("R", R, V, s["nV"]))
+        if "x0" in self.what:
+            assert isinstance(model.x0, Normal)
+            new["x0"] = Normal(s["x0"].mean(axis=0), model.x0.P)
+        return dataclasses.replace(model, **new)
+
+    def room(self, name: str, now: Array | None) -> tuple[Array, Array]:
+        """Return how far the entries of a matrix may move down and up within ``theta_bounds``."""
+        if now is None:
+            return np.zeros((self.model.nx, 0)), np.zeros((self.model.nx, 0))
+        lo, hi = np.full(now.shape, -np.inf), np.full(now.shape, np.inf)
+        for k, entry in enumerate(self.entries):
+            if entry.matrix == name and self.bounds is not None:
+                lo[entry.row, entry.column] = self.bounds.lo[k]
+                hi[entry.row, entry.column] = self.bounds.hi[k]
+        return lo - now, hi - now
+
+    def covariance(self, name: str, now: Varying, sums: Array, rows: Array) -> Array | Varying:
+        """Return the covariance that maximises the expected likelihood within its structure."""
+        kind, n = self.kinds[name], float(rows.sum())
+        if kind == "scaled":
+            return _scaled(now, _scale_of(self.stack(now), sums, rows))
+        S = sums.sum(axis=0) / n
+        S = 0.5 * (S + S.T)
+        return np.diag(np.diagonal(S)) if kind == "diagonal" else S
+
+    def stack(self, matrix: Varying) -> Array:
+        """Return the distinct matrices behind the kernel's sums of Q or R."""
+        if matrix.constant:
+            return matrix.single[None]
+        if matrix.value is not None:
+            return matrix.value
+        return matrix.stack(self.t, self.dt)[0]
+
+    # -- maximum likelihood --------------------------------------------------------------------------------------------
+
+    def ml(self, iterations: int, tolerance: float) -> Learned:
+        """Search by a few rounds of expectation maximisation, then L-BFGS with the exact gradient."""
+        from scipy.optimize import minimize
+
+        warm = self.em(min(4, iterations), tolerance)
+        if warm.status is Status.COLLAPSED:
+            return warm
+        start = warm.model
+        parts = [name for name in ("Q", "R") if name in self.what]
+        maps = {name: _Map(self.kinds[name], (start.w if name == "Q" else start.e).cov()) for name in parts}
+        sizes = [maps[name].size for name in parts]
+        n_seen = max(int(self.seen.sum()), 1)
+        history: list[float] = list(warm.history)
+        best: list[Any] = [warm.loglik, start]
+
+        def model_at(p: Array) -> Linear:
+            new: dict[str, Any] = {}
+            k = 0
+            for name, size in zip(parts, sizes, strict=True):
+                new["w" if name == "Q" else "e"] = Gaussian(maps[name].matrix(p[k : k + size]))
+                k += size
+            return dataclasses.replace(start, **new)
+
+        def objective(p: Array) -> tuple[float, Array]:
+            model = model_at(p)
+            s = self.expect(model)
+            if not s["ok"] or not np.isfinite(s["loglik"]):
+                return 1e10, np.zeros(len(p))
+            gradient, k = [], 0
+            for name, size in zip(parts, sizes, strict=True):
+                now = (model.w if name == "Q" else model.e).cov()
+                sums, rows = (s["W"], s["nW"]) if name == "Q" else (s["V"], s["nV"])
+                gradient.append(maps[name].gradient(p[k : k + size], self.stack(now), sums, rows))
+                k += size
+            if s["loglik"] > best[0]:
+                best[:] = [s["loglik"], model]
+            return -s["loglik"] / n_seen, -np.concatenate(gradient) / n_seen
+
+        def remember(_: Array) -> None:
+            history.append(best[0])
+
+        found = minimize(
+            objective,
+            np.concatenate([maps[name].start() for name in parts]),
+            jac=True,
+            method="L-BFGS-B",
+            callback=remember,
+            options={"maxiter": iterations, "ftol": tolerance * 1e-2, "gtol": 1e-7, "maxls": 40},
+        )
+        converged = bool(found.success) or "ABNORMAL" in str(found.message)
+        status = Status.OK if converged else Status.STALLED
+        message = f"converged after {found.nit} iterations" if converged else str(found.message)
+        info = {"message": message, "iterations": int(found.nit), "n_seen": n_seen, "evaluations": int(found.nfev)}
+        return Learned(best[1], float(best[0]), tuple(history), status, info)
+
+
+def _regression(Wz: Array, Z: Array, Q: Array, mask: Any, lo: Array, hi: Array) -> Array:
+    """Return the step D within its bounds that solves ``Q^-1 (Wz - D Z) = 0`` on the free entries of D, 0 elsewhere."""
+    step = np.zeros(Wz.shape)
+    weight = np.linalg.pinv(Q, hermitian=True)
+    if not np.any(weight):
+        weight = np.eye(len(Q))
+    i, j = np.nonzero(mask)
+    normal, right = weight[np.ix_(i, i)] * Z[np.ix_(j, j)], (weight @ Wz)[i, j]
+    low, high = lo[i, j], hi[i, j]
+    d, open_ = np.zeros(len(i)), np.ones(len(i), dtype=bool)
+    while open_.any():
+        rest = right[open_] - normal[np.ix_(open_, ~open_)] @ d[~open_]
+        d[open_] = np.linalg.lstsq(normal[np.ix_(open_, open_)], rest, rcond=None)[0]
+        out = open_ & ((d < low) | (d > high))
+        if not out.any():
+            break
+        d[out] = np.clip(d[out], low[out], high[out])
+        open_ &= ~out
+    step[i, j] = d
+    return step
+
+
+def _scale_of(stack: Array, sums: Array, rows: Array) -> float:
+    """Return the multiple of the given covariances that maximises the expected likelihood."""
+    inverse = np.linalg.pinv(stack, hermitian=True)
+    rank = np.linalg.matrix_rank(stack, hermitian=True)
+    total = float((rows * rank).sum())
+    return float(np.einsum("kij,kji->", inverse, sums)) / total if total > 0 else 1.0
+
+
+def _scaled(matrix: Varying, factor: float) -> Array | Varying:
+    if matrix.value is not None:
+        return matrix.value * factor
+    function: Callable[..., Any] | None = matrix.function
+    assert function is not None
+    return dataclasses.replace(matrix, function=lambda *a: factor * np.asarray(function(*a), dtype=float))
+
+
+class _Map:
+    """A covariance as free numbers: Cholesky factor with a logarithmic diagonal, log variances, or a log factor."""
+
+    def __init__(self, kind: str, now: Varying) -> None:
+        self.kind, self.now = kind, now
+        self.n = now.shape[0]
+        if kind == "full":
+            S = now.single
+            floor = 1e-8 * max(float(np.trace(S)) / self.n, 1e-300)
+            self.L = np.linalg.cholesky(S + floor * np.eye(self.n))
+            self.row, self.column = np.tril_indices(self.n)
+            self.unit = np.sqrt(np.diagonal(S) + floor)  # off-diagonal numbers in units of their row
+            self.size = len(self.row)
+        elif kind == "diagonal":
+            d = np.diagonal(now.single)
+            self.d = np.maximum(d, 1e-8 * max(float(d.max()), 1e-300))
+            self.size = self.n
+        else:
+            self.size = 1
+
+    def start(self) -> Array:
+        if self.kind == "full":
+            p = self.L[self.row, self.column] / self.unit[self.row]
+            diagonal = self.row == self.column
+            p[diagonal] = np.log(p[diagonal])
+            return np.asarray(p)
+        return np.log(self.d) if self.kind == "diagonal" else np.zeros(1)
+
+    def factor(self, p: Array) -> Array:
+        L = np.zeros((self.n, self.n))
+        diagonal = self.row == self.column
+        L[self.row, self.column] = np.where(diagonal, np.exp(np.clip(p, -300, 300)), p) * self.unit[self.row]
+        return L
+
+    def matrix(self, p: Array) -> Array | Varying:
+        if self.kind == "full":
+            L = self.factor(p)
+            return L @ L.T
+        if self.kind == "diagonal":
+            return np.diag(np.exp(np.clip(p, -600, 600)))
+        return _scaled(self.now, float(np.exp(np.clip(p[0], -600, 600))))
+
+    def gradient(self, p: Array, stack: Array, sums: Array, rows: Array) -> Array:
+        """Return the derivative of the log-likelihood by p, by Fisher's identity."""
+        if self.kind == "scaled":
+            inverse = np.linalg.pinv(stack, hermitian=True)
+            rank = np.linalg.matrix_rank(stack, hermitian=True)
+            fit = float(np.einsum("kij,kji->", inverse, sums))
+            return np.array([0.5 * (fit - float((rows * rank).sum()))])
+        S, n = sums.sum(axis=0), float(rows.sum())
+        if self.kind == "diagonal":
+            d = np.diagonal(stack[0])
+            return np.asarray(0.5 * (np.diagonal(S) / d - n))
+        L = self.factor(p)
+        half = np.linalg.solve(L, np.linalg.solve(L, S).T).T  # L^-1 S L^-T
+        G = np.linalg.solve(L.T, half - n * np.eye(self.n))  # 2 dS L, as Q^-1 (S - n Q) Q^-1 L
+        g = G[self.row, self.column] * self.unit[self.row]
+        diagonal = self.row == self.column
+        g[diagonal] *= np.exp(np.clip(p[diagonal], -300, 300))
+        return np.asarray(g)

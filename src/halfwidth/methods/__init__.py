@@ -1,0 +1,18 @@
+"""The estimators, one file a family. To export one, add its name and file here; the laws then run over it."""
+
+import importlib
+from typing import Any
+
+#: Exported estimators and the module of each; loaded when first used.
+ESTIMATORS: dict[str, str] = {
+    "KalmanFilter": "kalman",
+    "KalmanSmoother": "kalman",
+    "ExtendedKalman": "nonlinear",
+    "UnscentedKalman": "nonlinear",
+    "ParticleFilter": "particle",
+}
+
+
+def load(name: str) -> Any:
+    """Return the class of an exported estimator."""
+    return getattr(importlib.import_module(f"halfwidth.methods.{ESTIMATORS[name]}"), name)

@@ -1,0 +1,201 @@
+"""What is known of a state: a box, a Gaussian, or a cloud of points. Priors of x0 and spreads of answers.
+
+Each has ``interval(level) -> (lo, hi)`` and the flag ``guaranteed``, so that scores, plots and reports never ask which
+estimator ran.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from halfwidth.array import Array, covariance, extended, frozen, real
+from halfwidth.errors import BadShape, BadValue
+
+
+class Spread(Protocol):
+    """What `Estimate.spread` can do."""
+
+    @property
+    def guaranteed(self) -> bool:
+        """Whether the interval must contain the state."""
+        ...
+
+    def interval(self, level: float = 0.9) -> tuple[Array, Array]:
+        """Return (lo, hi), each shaped as the state."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """The state lies between `lo` and `hi`.
+
+    Parameters
+    ----------
+    lo, hi : scalar, (nx,) or (T, nx) array_like
+        Entry-wise bounds in the units of the state; infinite where there is none.
+    guaranteed : bool
+        Whether an answer's box is proved to contain the state.
+
+    Raises
+    ------
+    BadShape, BadValue
+        If the shapes differ, an entry is NaN, or `lo` exceeds `hi`.
+
+    Examples
+    --------
+    >>> Box(-1, [1, 2]).hi
+    array([1., 2.])
+    """
+
+    lo: Array
+    hi: Array
+    guaranteed: bool = False
+
+    def __init__(self, lo: ArrayLike, hi: ArrayLike, *, guaranteed: bool = False) -> None:
+        a, b = extended(lo, "lo"), extended(hi, "hi")
+        try:
+            a, b = (np.array(v) for v in np.broadcast_arrays(a, b))
+        except ValueError:
+            raise BadShape(f"`lo` has shape {a.shape} but `hi` has shape {b.shape}") from None
+        if np.any(a > b) or np.any(a == np.inf) or np.any(b == -np.inf):
+            k = int(np.argmax((a > b).ravel()))
+            raise BadValue(f"`lo` exceeds `hi` at entry {k}: {a.ravel()[k]:g} > {b.ravel()[k]:g}")
+        object.__setattr__(self, "lo", frozen(a))
+        object.__setattr__(self, "hi", frozen(b))
+        object.__setattr__(self, "guaranteed", guaranteed)
+
+    def sized(self, n: int, name: str) -> "Box":
+        """Return the box with `n` entries, repeating a scalar."""
+        if self.lo.ndim == 0:
+            return Box(np.full(n, float(self.lo)), np.full(n, float(self.hi)))
+        if self.lo.shape != (n,):
+            raise BadShape(f"`{name}` is a box of shape {self.lo.shape}, ({n},) was expected")
+        return self
+
+    @property
+    def mean(self) -> Array:
+        """Midpoint; 0 or the finite end where an end is infinite."""
+        lo = np.where(np.isfinite(self.lo), self.lo, np.where(np.isfinite(self.hi), self.hi, 0.0))
+        hi = np.where(np.isfinite(self.hi), self.hi, lo)
+        return np.asarray(0.5 * lo + 0.5 * hi)
+
+    def interval(self, level: float = 0.9) -> tuple[Array, Array]:
+        """Return the box itself, whatever the level."""
+        _level(level)
+        return self.lo, self.hi
+
+    def sample(self, rng: np.random.Generator) -> Array:
+        """Draw one state uniformly; a side without end is refused."""
+        if not (np.isfinite(self.lo).all() and np.isfinite(self.hi).all()):
+            raise BadValue(
+                "`x0` is an infinite box, so no state can be drawn from it",
+                hint="give a finite Box(lo, hi) or Normal(mean, P)",
+            )
+        return rng.uniform(self.lo, self.hi)
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """The state is Gaussian.
+
+    Parameters
+    ----------
+    mean : (nx,) or (T, nx) array_like
+    P : scalar, (nx,) variances, (nx, nx), or (T, nx, nx) array_like
+        Covariance in squared units of the state.
+
+    Raises
+    ------
+    BadShape, BadValue
+        If shapes do not fit or `P` is asymmetric or indefinite.
+
+    Examples
+    --------
+    >>> lo, hi = Normal([0.0], 1.0).interval(0.95)
+    >>> float(hi[0].round(2))
+    1.96
+    """
+
+    mean: Array
+    P: Array
+    guaranteed = False
+
+    def __init__(self, mean: ArrayLike, P: ArrayLike) -> None:
+        m = np.atleast_1d(real(mean, "mean"))
+        n = m.shape[-1]
+        p = real(P, "P")
+        if p.ndim == 0 or (p.ndim == 1 and p.shape == (n,)):
+            if np.any(p < 0):
+                raise BadValue(f"`P` holds the variance {np.min(p):g}, none below 0 was expected")
+            p = np.diag(np.broadcast_to(p, (n,)))
+        if p.shape != (*m.shape, n):
+            raise BadShape(f"`P` has shape {p.shape}, {(*m.shape, n)} was expected from `mean`")
+        object.__setattr__(self, "mean", frozen(m))
+        object.__setattr__(self, "P", frozen(covariance(p, "P")))
+
+    @classmethod
+    def of(cls, mean: Array, P: Array) -> "Normal":
+        """Wrap a kernel's answer, (T, nx) and (T, nx, nx), without judging it again."""
+        answer = object.__new__(cls)
+        object.__setattr__(answer, "mean", mean)
+        object.__setattr__(answer, "P", P)
+        return answer
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations, shaped as `mean`."""
+        return np.sqrt(np.maximum(np.diagonal(self.P, axis1=-2, axis2=-1), 0.0))
+
+    def interval(self, level: float = 0.9) -> tuple[Array, Array]:
+        """Return mean minus and plus the two-sided quantile of `level`."""
+        from statistics import NormalDist
+
+        half = NormalDist().inv_cdf(0.5 + 0.5 * _level(level)) * self.sd
+        return self.mean - half, self.mean + half
+
+    def sample(self, rng: np.random.Generator) -> Array:
+        """Draw one state (nx,)."""
+        return rng.multivariate_normal(self.mean, self.P, method="eigh")
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """The state is spread as weighted points.
+
+    Parameters
+    ----------
+    points : (T, N, nx) array
+    weights : (T, N) array
+        Not negative, each row sums to one.
+    """
+
+    points: Array
+    weights: Array
+    guaranteed = False
+
+    @property
+    def mean(self) -> Array:
+        """Weighted mean, (T, nx)."""
+        return np.asarray(np.einsum("tn,tni->ti", self.weights, self.points))
+
+    def interval(self, level: float = 0.9) -> tuple[Array, Array]:
+        """Return the weighted quantiles that leave the same weight outside on either side, each (T, nx)."""
+        tail = 0.5 - 0.5 * _level(level)
+        order = np.argsort(self.points, axis=1)
+        points = np.take_along_axis(self.points, order, axis=1)
+        weights = np.take_along_axis(np.broadcast_to(self.weights[..., None], self.points.shape), order, axis=1)
+        below = np.cumsum(weights, axis=1)
+        below /= below[:, -1:]
+        ends = []
+        for share in (tail, 1.0 - tail):
+            first = np.argmax(below >= share * (1 - 1e-12), axis=1)
+            ends.append(np.take_along_axis(points, first[:, None], axis=1)[:, 0])
+        return ends[0], ends[1]
+
+
+def _level(level: float) -> float:
+    if not 0.0 < level < 1.0:
+        raise BadValue(f"`level` is {level!r}, a number between 0 and 1 was expected", hint="level=0.9")
+    return float(level)

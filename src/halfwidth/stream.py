@@ -1,0 +1,312 @@
+"""The one object that holds state: rows go in, the newest estimate comes out; saved as bytes, resumed anywhere.
+
+`stream` gives the online form of a method that has one. The Kalman family runs in a C++ object with its own buffers;
+other recursive methods are stepped through `Recursive.step`, with the same numbers as their offline form. A snapshot
+holds plain numbers and names with a version and a check sum, never code, so bytes from elsewhere are safe to read.
+"""
+
+import base64
+import dataclasses
+import json
+import math
+import zlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from halfwidth import methods
+from halfwidth.array import Array
+from halfwidth.errors import BadRecord, BadValue, Refused, hinted
+from halfwidth.estimate import choose
+from halfwidth.methods._protocol import typed
+from halfwidth.model import Linear, Model
+from halfwidth.noise import Gaussian
+from halfwidth.result import Estimate, Newest, Status
+from halfwidth.spread import Normal
+
+_MAGIC = b"HWSTREAM"
+_VERSION = 1
+
+
+class Stream:
+    """A method running on line. Made by `stream` or `resume`.
+
+    Attributes
+    ----------
+    push : callable
+        ``push(y, u=None, dt=None)`` folds one row in and returns the newest estimate, an `Estimate` of one row. None or
+        NaN in `y` is a missing entry, ``push(None)`` a row without any output; `dt` is the step before the row in s,
+        ``model.dt`` if absent.
+    model : Linear or Nonlinear
+    method : estimator
+    """
+
+    __slots__ = ("_core", "method", "model", "push")
+
+    def __init__(self, model: Model, method: Any, core: Any) -> None:
+        self.model = model
+        self.method = method
+        self._core = core
+        self.push = core.push  # the bound method itself: one look-up less at each row
+
+    @property
+    def rows(self) -> int:
+        """Number of rows pushed so far."""
+        return int(self._core.pushed)
+
+    @property
+    def t(self) -> float:
+        """Time of the newest row, s."""
+        return float(self._core.t)
+
+    def snapshot(self) -> bytes:
+        """Return everything `resume` needs, as bytes.
+
+        A linear Gaussian model of constant matrices is part of it; any other model is given to `resume` again.
+        """
+        head = {
+            "method": [type(self.method).__name__, _settings(self.method)],
+            "model": _model_to_json(self.model),
+            "sizes": [self.model.nx, self.model.ny, self.model.nu],
+        }
+        body = json.dumps(head).encode()
+        state = self._core.snapshot()
+        parts = _MAGIC + _VERSION.to_bytes(4, "little") + len(body).to_bytes(8, "little") + body + state
+        return parts + zlib.crc32(parts).to_bytes(4, "little")
+
+    def __repr__(self) -> str:
+        return f"Stream({typed(self.method)}, {self.rows} rows, t = {self.t:g} s)"
+
+
+def stream(model: Model, method: Any = None, *, t: float = 0.0) -> Stream:
+    """Return the online form of a method.
+
+    Parameters
+    ----------
+    model : Linear or Nonlinear
+    method : estimator, optional
+        One with an online form, such as ``KalmanFilter()`` or ``KalmanSmoother(lag=10)``; chosen if absent.
+    t : float
+        Time of the prior, one step before the first row, s.
+
+    Raises
+    ------
+    Refused
+        If the method cannot work on the model or has no online form.
+
+    Examples
+    --------
+    >>> import halfwidth as hw
+    >>> walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(1.0), hw.Gaussian(1.0), hw.Normal([0.0], 1.0))
+    >>> live = hw.stream(walk, hw.KalmanFilter())
+    >>> float(live.push(1.0).x[0, 0].round(3)), float(live.push(None).x[0, 0].round(3))
+    (0.667, 0.667)
+    """
+    if method is None:
+        method = methods.load("KalmanFilter")()
+        reason = method.refuses(model)
+        if reason is not None:
+            message, hint = hinted(reason)
+            raise Refused(f"no default method runs on a stream of this model; {message}", hint=hint)
+    method = choose(model, method)
+    if not math.isfinite(t):
+        raise BadValue(f"`t` is {t!r}, a finite time in seconds was expected")
+    if hasattr(method, "stream"):
+        return Stream(model, method, method.stream(model, float(t)))
+    if hasattr(method, "step"):
+        return Stream(model, method, _Stepped(model, method, float(t)))
+    raise Refused(f"`{typed(method)}` has no online form", hint="KalmanFilter(), or Window(method) for a batch method")
+
+
+def resume(snapshot: bytes, model: Model | None = None) -> Stream:
+    """Return a stream as it was when its snapshot was taken.
+
+    Parameters
+    ----------
+    snapshot : bytes
+    model : Linear or Nonlinear, optional
+        Needed if the model holds functions or stacked matrices, which no snapshot keeps.
+
+    Raises
+    ------
+    BadValue
+        If the bytes are no snapshot, are damaged, or belong to a model of another size.
+    """
+    if not isinstance(snapshot, bytes | bytearray | memoryview):
+        raise BadValue(f"`snapshot` is a {type(snapshot).__name__}, the bytes of `live.snapshot()` were expected")
+    data = bytes(snapshot)
+    if len(data) < 24 or data[:8] != _MAGIC:
+        raise BadValue(f"`snapshot` of {len(data)} bytes is not one of a stream")
+    version = int.from_bytes(data[8:12], "little")
+    if version != _VERSION:
+        raise BadValue(f"`snapshot` has version {version}, {_VERSION} was expected")
+    if zlib.crc32(data[:-4]) != int.from_bytes(data[-4:], "little"):
+        raise BadValue("`snapshot` is damaged: its check sum is wrong")
+    size = int.from_bytes(data[12:20], "little")
+    head = json.loads(data[20 : 20 + size])
+    name, settings = head["method"]
+    if name not in methods.ESTIMATORS:
+        raise BadValue(f"`snapshot` is of `{name}`, which this version does not have")
+    if model is None:
+        if head["model"] is None:
+            raise BadValue("`snapshot` does not hold its model", hint="resume(snapshot, model)")
+        model = _model_from_json(head["model"])
+    if [model.nx, model.ny, model.nu] != head["sizes"]:
+        raise BadValue(
+            f"`snapshot` is of a model with nx, ny, nu = {head['sizes']},"
+            f" but `model` has {[model.nx, model.ny, model.nu]}"
+        )
+    live = stream(model, methods.load(name)(**settings))
+    try:
+        live._core.restore(data[20 + size : -4])
+    except ValueError as exc:
+        raise BadValue(f"`snapshot` does not fit: {exc}") from exc
+    return live
+
+
+# ---- any recursive method --------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Belief:
+    t: float
+    x: Array
+    P: Array
+    loglik: float
+    code: int
+    rows: int
+
+
+class _Stepped:
+    """A `Recursive` method held at its newest state."""
+
+    def __init__(self, model: Model, method: Any, t: float) -> None:
+        self.model, self.method, self.t, self.pushed = model, method, t, 0
+        self.state = method.init(model)
+        self.kind = type("NewestStep", (Newest,), {"__slots__": (), "method": typed(method), "names": model.names.x})
+
+    def push(self, y: ArrayLike | None, u: ArrayLike | None = None, dt: float | None = None) -> Estimate:
+        model = self.model
+        step = model.dt if dt is None else float(dt)
+        if not step > 0 or not math.isfinite(step):
+            raise BadRecord(f"`dt` is {dt!r}, a positive number of seconds was expected")
+        row = np.full(model.ny, np.nan) if y is None else np.atleast_1d(np.array(y, dtype=float))
+        if row.shape != (model.ny,) or np.isinf(row).any():
+            raise BadRecord(f"`y` is {y!r}, {model.ny} numbers were expected; None or NaN is missing")
+        inputs = None if u is None else np.atleast_1d(np.array(u, dtype=float))
+        if (0 if inputs is None else inputs.size) != model.nu or (inputs is not None and not np.isfinite(inputs).all()):
+            raise BadRecord(f"`u` is {u!r}, {model.nu} finite numbers were expected")
+        self.state = self.method.step(model, self.state, row, inputs, self.t + step, step)
+        self.t += step
+        self.pushed += 1
+        x, P, loglik = self.method.belief(model, self.state)
+        newest: Estimate = object.__new__(self.kind)
+        code = 0 if np.isfinite(x).all() else 3
+        object.__setattr__(newest, "_belief", _Belief(self.t, x, P, float(loglik), code, self.pushed))
+        return newest
+
+    def snapshot(self) -> bytes:
+        leaves = [base64.b64encode(np.ascontiguousarray(leaf).tobytes()).decode() for leaf in _leaves(self.state)]
+        kinds = [np.asarray(leaf).dtype.str + str(np.shape(leaf)) for leaf in _leaves(self.state)]
+        return json.dumps({"t": self.t.hex(), "pushed": self.pushed, "kinds": kinds, "leaves": leaves}).encode()
+
+    def restore(self, saved: bytes) -> None:
+        found = json.loads(saved)
+        now = _leaves(self.state)
+        if len(now) != len(found["kinds"]):
+            raise ValueError(f"it holds {len(found['kinds'])} numbers or arrays, the method has {len(now)}")
+        values = []
+        for kind, leaf in zip(found["kinds"], found["leaves"], strict=True):
+            dtype, _, shape = kind.partition("(")
+            if dtype[1] not in "fiub":
+                raise ValueError(f"it holds an array of kind {dtype}")
+            sizes = [int(n) for n in shape.rstrip(")").split(",") if n.strip()]
+            values.append(np.frombuffer(base64.b64decode(leaf), dtype=dtype).reshape(sizes).copy())
+        self.state = _with_leaves(self.state, iter(values))
+        self.t, self.pushed = float.fromhex(found["t"]), int(found["pushed"])
+
+
+def _leaves(state: Any) -> list[Any]:
+    """Return the numbers and arrays of a nested state, in order."""
+    if dataclasses.is_dataclass(state):
+        return [leaf for f in dataclasses.fields(state) for leaf in _leaves(getattr(state, f.name))]
+    if isinstance(state, tuple | list):
+        return [leaf for part in state for leaf in _leaves(part)]
+    if isinstance(state, dict):
+        return [leaf for key in sorted(state) for leaf in _leaves(state[key])]
+    if isinstance(state, np.ndarray | int | float | np.number | bool):
+        return [state]
+    if state is None:
+        return []
+    raise Refused(f"a state that holds a {type(state).__name__} cannot be saved")
+
+
+def _with_leaves(state: Any, values: Any) -> Any:
+    """Return a state of the same structure with other leaves."""
+    if dataclasses.is_dataclass(state) and not isinstance(state, type):
+        return dataclasses.replace(
+            state, **{f.name: _with_leaves(getattr(state, f.name), values) for f in dataclasses.fields(state)}
+        )
+    if isinstance(state, tuple) and hasattr(state, "_fields"):
+        return type(state)(*[_with_leaves(part, values) for part in state])
+    if isinstance(state, tuple | list):
+        return type(state)([_with_leaves(part, values) for part in state])
+    if isinstance(state, dict):
+        return {key: _with_leaves(state[key], values) for key in sorted(state)}
+    if state is None:
+        return None
+    value = next(values)
+    return value if isinstance(state, np.ndarray) else type(state)(value[()])
+
+
+# ---- settings and models as plain data -------------------------------------------------------------------------------
+
+
+def _settings(method: Any) -> dict[str, Any]:
+    found = {f.name: getattr(method, f.name) for f in dataclasses.fields(method)}
+    for name, value in found.items():
+        if isinstance(value, np.integer | np.floating):
+            found[name] = value.item()
+        elif value is not None and not isinstance(value, bool | int | float | str):
+            raise Refused(
+                f"the setting `{name}` of `{typed(method)}` is no plain number or word, so it cannot be saved"
+            )
+    return found
+
+
+def _model_to_json(model: Model) -> dict[str, Any] | None:
+    if not isinstance(model, Linear) or not isinstance(model.x0, Normal) or model.loss is not None:
+        return None
+    if not isinstance(model.w, Gaussian) or not isinstance(model.e, Gaussian) or model.bounds is not None:
+        return None
+    varying = {**model.matrices, "Q": model.w.cov(), "R": model.e.cov()}
+    if not all(m.constant for m in varying.values()):
+        return None
+    plain: dict[str, Any] = {name: m.single.tolist() for name, m in varying.items()}
+    shapes = {name: list(m.shape) for name, m in varying.items()}
+    return plain | {
+        "shapes": shapes,
+        "x0": [model.x0.mean.tolist(), model.x0.P.tolist()],
+        "dt": model.dt,
+        "names": model.names._asdict(),
+    }
+
+
+def _model_from_json(plain: dict[str, Any]) -> Linear:
+    found = {name: np.array(plain[name], dtype=float).reshape(shape) for name, shape in plain["shapes"].items()}
+    return Linear(
+        found["A"],
+        found.get("B"),
+        found["C"],
+        Gaussian(found["Q"]),
+        Gaussian(found["R"]),
+        Normal(*plain["x0"]),
+        E=found.get("E"),
+        F=found.get("F"),
+        dt=plain["dt"],
+        names=plain["names"],
+    )
+
+
+__all__ = ["Status", "Stream", "resume", "stream"]

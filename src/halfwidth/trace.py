@@ -1,0 +1,585 @@
+"""Record a NumPy function once as a tape that the core runs at C++ speed.
+
+The function is called with object arrays whose entries record every operation made with them; NumPy hands
+element-wise functions, products and sums through to the entries. What comes out is a straight-line program, a
+`Tape`: values at many points at once, and the exact Jacobian by forward mode [1]_. A function that branches on a
+value, or turns one into a float (``math.sin``, a float array written entry by entry, SciPy), cannot be recorded:
+`trace` raises `Untraceable`, and the caller keeps to Python. A tape is compared with its function at points before
+anything is built on it (`Tape.agrees`).
+
+References
+----------
+.. [1] Griewank and Walther (2008), Evaluating Derivatives, ch. 2 and 3.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Tape", "Untraceable", "compiled", "trace"]
+
+_TURNED = (
+    "a traced value was turned into a plain number; write `np.sin` rather than `math.sin`, and build arrays with "
+    "`np.array([...])` or `np.zeros_like(x)` rather than filling a float array"
+)
+_BRANCHED = "it branches on a value; `np.where` can be traced, `if` cannot"
+
+
+class Untraceable(Exception):
+    """The function cannot be recorded; the message says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tape:
+    """A function as a straight-line program of elementary operations.
+
+    Parameters
+    ----------
+    code : (n, 4) int32 array
+        Operation and argument slots of every step; the core numbers the operations.
+    constant : (n,) array
+        Value of the steps that are constants.
+    out : (n_out,) int32 array
+        Slots of the answer.
+    sizes : tuple of int
+        Numbers of entries of the arguments, in order.
+    """
+
+    code: NDArray[np.int32]
+    constant: NDArray[np.float64]
+    out: NDArray[np.int32]
+    sizes: tuple[int, ...]
+
+    def _points(self, arguments: Sequence[Any]) -> NDArray[np.float64]:
+        # Arguments with the same number of rows, or one row repeated, side by side: (N, n_in).
+        given = zip(arguments, self.sizes, strict=True)
+        blocks = [np.asarray(a, dtype=np.float64).reshape(-1, n) for a, n in given if n]
+        rows = max((len(b) for b in blocks), default=1)
+        return np.concatenate([np.broadcast_to(b, (rows, b.shape[1])) for b in blocks], axis=1)
+
+    def __call__(self, *arguments: Any) -> NDArray[np.float64]:
+        """Values at N points.
+
+        Parameters
+        ----------
+        *arguments : (N, size) or (size,) arrays
+            One for each of `sizes`; a single row serves all points.
+
+        Returns
+        -------
+        (N, n_out) array
+        """
+        from halfwidth._core import tape_evaluate
+
+        return tape_evaluate(self.code, self.constant, self.out, self._points(arguments))  # type: ignore[no-any-return]
+
+    def jacobian(self, *arguments: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Values (N, n_out) and exact Jacobians (N, n_out, n) along the n entries of the first argument."""
+        from halfwidth._core import tape_jacobian
+
+        points = self._points(arguments)
+        value, slope = tape_jacobian(self.code, self.constant, self.out, points, self.sizes[0])
+        return value, slope
+
+    def agrees(self, f: Callable[..., Any], points: Iterable[tuple[Any, ...]]) -> bool:
+        """Whether the tape and the function give the same at every point where the function is finite.
+
+        Rounding is allowed for (a few hundred units in the last place of the largest entry); one finite point at
+        least is needed to say yes.
+        """
+        tested = False
+        for arguments in points:
+            with np.errstate(all="ignore"):
+                expected = np.asarray(f(*_called(arguments, self.sizes)))
+                if expected.dtype.kind not in "biuf" or expected.size != len(self.out):
+                    return False
+                expected = expected.astype(np.float64).ravel()
+                got = self(*arguments)[0]
+            if not np.isfinite(expected).all():
+                continue
+            scale = np.abs(expected).max(initial=0.0) + np.finfo(np.float64).tiny
+            if not np.abs(got - expected).max() <= 1e-13 * 256 * scale:
+                return False
+            tested = True
+        return tested
+
+
+def trace(f: Callable[..., Any], sizes: Sequence[int | None]) -> Tape:
+    """Record `f` as a tape.
+
+    Parameters
+    ----------
+    f : callable
+        Takes one array (or number) for each of `sizes` and returns an array or a number.
+    sizes : sequence of int or None
+        Numbers of entries of the arguments; None for a plain number; 0 for an argument that is None.
+
+    Returns
+    -------
+    Tape
+
+    Raises
+    ------
+    Untraceable
+        If `f` branches on a value, leaves NumPy, or fails.
+
+    Examples
+    --------
+    >>> tape = trace(lambda x: np.array([np.hypot(x[0], x[1]), x[0] * x[1]]), (2,))
+    >>> tape([3.0, 4.0])
+    array([[ 5., 12.]])
+    >>> tape.jacobian([3.0, 4.0])[1]
+    array([[[0.6, 0.8],
+            [4. , 3. ]]])
+    """
+    record = _Recorder()
+    arguments: list[Any] = []
+    entry = 0
+    for n in sizes:
+        variables = [record.step("input", entry + i) for i in range(1 if n is None else n)]
+        entry += len(variables)
+        arguments.append(variables[0] if n is None else _entries(variables) if n else None)
+    try:
+        with np.errstate(all="ignore"):
+            answer = f(*arguments)
+        slots = [record.slot(a) for a in np.asarray(answer, dtype=object).ravel()]
+    except Untraceable:
+        raise
+    except Exception as error:  # whatever NumPy or the function says to entries that are not numbers
+        raise Untraceable(f"{type(error).__name__}: {error}") from error
+    if not slots:
+        raise Untraceable("it returns nothing")
+    widths = tuple(1 if n is None else n for n in sizes)
+    return record.tape(slots, widths)
+
+
+def compiled(f: Callable[..., Any], sizes: Sequence[int | None], points: Iterable[tuple[Any, ...]]) -> Tape:
+    """Record `f` and compare the tape with it at `points`.
+
+    Raises
+    ------
+    Untraceable
+        If `f` cannot be recorded, or gives something else than its tape: it is random, keeps state, or is not finite
+        at any of the points.
+    """
+    tape = trace(f, sizes)
+    if not tape.agrees(f, points):
+        raise Untraceable("what was recorded gives other values than the function itself; is it random, or does it count?")
+    return tape
+
+
+def _called(arguments: Sequence[Any], sizes: Sequence[int]) -> list[Any]:
+    """Give arguments as the function expects them: None for none, fresh arrays so that it may write into them."""
+    return [
+        None if n == 0 else float(a) if np.ndim(a) == 0 else np.array(a, dtype=np.float64)
+        for a, n in zip(arguments, sizes, strict=True)
+    ]
+
+
+@cache
+def _codes() -> dict[str, int]:
+    from halfwidth._core import tape_operations
+
+    return {name: code for code, (name, _) in enumerate(tape_operations())}
+
+
+# What NumPy's functions are called on the tape, where the name is another one.
+_NAMES = {
+    "abs": "absolute", "fabs": "absolute", "acos": "arccos", "acosh": "arccosh", "asin": "arcsin",
+    "asinh": "arcsinh", "atan": "arctan", "atan2": "arctan2", "atanh": "arctanh", "pow": "power",
+    "true_divide": "divide", "mod": "remainder", "fmax": "maximum", "fmin": "minimum",
+}  # fmt: skip
+_TWO = frozenset(
+    "add subtract multiply divide power arctan2 hypot maximum minimum remainder fmod floor_divide "
+    "less less_equal equal not_equal".split()
+)
+_COMMUTING = frozenset({"add", "multiply", "hypot", "equal", "not_equal"})
+_SPLIT: dict[str, Callable[..., Any]] = {
+    "positive": lambda a: a,
+    "conjugate": lambda a: a,
+    "deg2rad": lambda a: a * (np.pi / 180.0),
+    "radians": lambda a: a * (np.pi / 180.0),
+    "rad2deg": lambda a: a * (180.0 / np.pi),
+    "degrees": lambda a: a * (180.0 / np.pi),
+    "greater": lambda a, b: b < a,
+    "greater_equal": lambda a, b: b <= a,
+    "logical_and": lambda a, b: (a != 0) * (b != 0),
+    "logical_or": lambda a, b: ((a != 0) + (b != 0)) != 0,
+    "logical_xor": lambda a, b: (a != 0) != (b != 0),
+    "logical_not": lambda a: a == 0,
+    "logaddexp": lambda a, b: np.maximum(a, b) + np.log1p(np.exp(-abs(a - b))),
+    "bitwise_and": lambda a, b: a & b,
+    "bitwise_or": lambda a, b: a | b,
+    "bitwise_xor": lambda a, b: a ^ b,
+    "invert": lambda a: ~a,
+}
+
+
+class _Recorder:
+    """The steps recorded so far; equal steps share one slot."""
+
+    def __init__(self) -> None:
+        self.steps: list[tuple[str, tuple[int, ...], float]] = []
+        self.known: dict[tuple[str, tuple[int, ...], float, float], int] = {}
+
+    def step(self, name: str, *arguments: int, value: float = 0.0) -> "_Variable":
+        # The sign belongs to the key: 0.0 == -0.0, but 1 / x tells them apart.
+        key = (name, arguments, value, float(np.copysign(1.0, value)))
+        slot = self.known.get(key)
+        if slot is None:
+            slot = self.known[key] = len(self.steps)
+            self.steps.append((name, arguments, value))
+        return _Variable(self, slot, boolean=name in _BOOLEAN)
+
+    def slot(self, a: Any) -> int:
+        """Slot of a variable, or of a constant."""
+        if isinstance(a, _Variable):
+            if a.record is not self:
+                raise Untraceable("it keeps a value from another call")
+            return a.slot
+        if isinstance(a, np.ndarray) and a.ndim == 0:
+            return self.slot(a[()])
+        if isinstance(a, bool | int | float | np.bool_ | np.integer | np.floating):
+            value = float(a)
+            if value != value:
+                raise Untraceable("it computes with NaN")
+            return self.step("constant", value=value).slot
+        raise Untraceable(f"it computes with a {type(a).__name__}")
+
+    def value(self, slot: int) -> float | None:
+        """Number in a slot if it is a constant."""
+        name, _, value = self.steps[slot]
+        return value if name == "constant" else None
+
+    def apply(self, name: str, *given: Any) -> "_Variable":
+        arguments = tuple(self.slot(a) for a in given)
+        numbers = [self.value(a) for a in arguments]
+        if all(n is not None for n in numbers):
+            return self.step("constant", value=_folded(name, numbers))
+        simpler = self._simpler(name, arguments, numbers)
+        if simpler is not None:
+            return simpler
+        if name in _COMMUTING:
+            arguments = tuple(sorted(arguments))
+        return self.step(name, *arguments)
+
+    def _simpler(
+        self, name: str, arguments: tuple[int, ...], numbers: list[float | None]
+    ) -> "_Variable | None":
+        """Neutral and zero factors, and small powers: what products with sparse matrices leave behind."""
+
+        def here(slot: int) -> _Variable:
+            return _Variable(self, slot)
+
+        match name:
+            case "add" if numbers[0] == 0.0:
+                return here(arguments[1])
+            case "add" | "subtract" if numbers[1] == 0.0:
+                return here(arguments[0])
+            case "multiply" if 0.0 in numbers:
+                return self.step("constant", value=0.0)
+            case "multiply" if numbers[0] == 1.0:
+                return here(arguments[1])
+            case "multiply" | "divide" if numbers[1] == 1.0:
+                return here(arguments[0])
+            case "multiply" if arguments[0] == arguments[1]:
+                return self.step("square", arguments[0])
+            case "subtract" if numbers[0] == 0.0:
+                return self.step("negative", arguments[1])
+            case "power" if numbers[1] == 1.0:
+                return here(arguments[0])
+            case "power" if numbers[1] == 2.0:
+                return self.step("square", arguments[0])
+            case "power" if numbers[1] == 3.0:
+                return self.apply("multiply", self.step("square", arguments[0]), here(arguments[0]))
+            case "power" if numbers[1] == 0.5:
+                return self.step("sqrt", arguments[0])
+            case "power" if numbers[1] == -1.0:
+                return self.step("reciprocal", arguments[0])
+        return None
+
+    def tape(self, slots: list[int], sizes: tuple[int, ...]) -> Tape:
+        """Keep the steps the answer needs, renumbered."""
+        needed: set[int] = set()
+        waiting = list(slots)
+        while waiting:
+            slot = waiting.pop()
+            if slot not in needed:
+                needed.add(slot)
+                name, arguments, _ = self.steps[slot]
+                if name != "input":
+                    waiting.extend(arguments)
+        order = {slot: k for k, slot in enumerate(sorted(needed))}
+        code = np.zeros((len(order), 4), dtype=np.int32)
+        constant = np.zeros(len(order))
+        for slot, k in order.items():
+            name, arguments, value = self.steps[slot]
+            code[k, 0] = _codes()[name]
+            for i, a in enumerate(arguments, start=1):
+                code[k, i] = a if name == "input" else order[a]
+            constant[k] = value
+        return Tape(code, constant, np.array([order[s] for s in slots], dtype=np.int32), sizes)
+
+
+_BOOLEAN = frozenset({"less", "less_equal", "equal", "not_equal"})
+
+
+def _folded(name: str, numbers: list[Any]) -> float:
+    """Value of an operation on constants."""
+    f = np.where if name == "where" else getattr(np, name)
+    with np.errstate(all="ignore"):
+        value = float(f(*numbers))
+    if value != value:
+        raise Untraceable("it computes with NaN")
+    return value
+
+
+def _entries(variables: Sequence["_Variable"]) -> "_Array":
+    array = np.empty(len(variables), dtype=object)
+    array[:] = variables
+    return array.view(_Array)
+
+
+def _plain(a: Any) -> Any:
+    """Without our types around it, so that NumPy's own object loops run."""
+    if isinstance(a, _Variable):
+        box = np.empty((), dtype=object)
+        box[()] = a
+        return box
+    if isinstance(a, _Array):
+        return a.view(np.ndarray)
+    if isinstance(a, tuple | list):
+        return type(a)(_plain(b) for b in a)
+    return a
+
+
+def _ours(a: Any) -> Any:
+    if isinstance(a, np.ndarray) and a.dtype == object:
+        return a.view(_Array) if a.ndim else a[()]
+    if isinstance(a, tuple):
+        return tuple(_ours(b) for b in a)
+    return a
+
+
+def _elementwise(name: str, inputs: Sequence[Any]) -> Any:
+    """One ufunc, entry by entry, where an entry may be a variable or a number."""
+
+    def one(*entries: Any) -> Any:
+        for a in entries:
+            if isinstance(a, _Variable):
+                return a.record.apply(name, *entries)
+        return getattr(np, name)(*entries)
+
+    f = _SPLIT.get(name, one)
+    return _ours(np.frompyfunc(f, len(inputs), 1)(*(_plain(a) for a in inputs)))
+
+
+def _ufunc(ufunc: np.ufunc, method: str, inputs: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    name = _NAMES.get(ufunc.__name__, ufunc.__name__)
+    out = kwargs.pop("out", None)
+    if method == "__call__" and not kwargs and (name in _codes() or name in _SPLIT):
+        result = _elementwise(name, inputs)
+    elif name in _TWO | {"logical_and", "logical_or"} and method in {"reduce", "accumulate"}:
+        # NumPy's own object loops of these compare and branch; ours do not.
+        step = np.frompyfunc(lambda a, b: _elementwise(name, (a, b)), 2, 1)
+        kwargs.pop("dtype", None)
+        result = _ours(getattr(step, method)(*(_plain(a) for a in inputs), **kwargs))
+    else:
+        result = _ours(getattr(ufunc, method)(*(_plain(a) for a in inputs), **kwargs))
+    if out is None:
+        return result
+    if not isinstance(out[0], _Array):
+        raise Untraceable(_TURNED)
+    out[0][...] = result
+    return out[0]
+
+
+def _where(condition: Any, *values: Any) -> Any:
+    if len(values) != 2:
+        raise Untraceable(_BRANCHED)
+
+    def one(c: Any, a: Any, b: Any) -> Any:
+        if not isinstance(c, _Variable):
+            return a if c else b
+        return c.record.apply("where", c, a, b)
+
+    return _ours(np.frompyfunc(one, 3, 1)(*(_plain(a) for a in (condition, *values))))
+
+
+def _clip(a: Any, a_min: Any = None, a_max: Any = None, **named: Any) -> Any:
+    low, high = named.pop("min", a_min), named.pop("max", a_max)
+    if named:
+        raise Untraceable("`np.clip` with " + ", ".join(named))
+    if low is not None:
+        a = _elementwise("maximum", (a, low))
+    return a if high is None else _elementwise("minimum", (a, high))
+
+
+def _function(f: Callable[..., Any], args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    if f is np.where:
+        return _where(*args, **kwargs)
+    if f is np.clip:
+        return _clip(*args, **kwargs)
+    if f in {np.max, np.amax, np.min, np.amin} and not kwargs.keys() - {"axis"}:
+        step = np.maximum if f in {np.max, np.amax} else np.minimum
+        axis = kwargs.get("axis", args[1] if len(args) > 1 else None)
+        return _ufunc(step, "reduce", (_ours(_plain(args[0])),), {"axis": axis})
+    plain = [_plain(a) for a in args]
+    return _ours(f(*plain, **{k: _plain(a) for k, a in kwargs.items()}))
+
+
+class _Array(np.ndarray):  # type: ignore[type-arg]
+    """An object array whose comparisons and choices are recorded, not decided."""
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        return _ufunc(ufunc, method, inputs, kwargs)
+
+    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:  # noqa: ARG002
+        return _function(func, args, kwargs)
+
+    def max(self, axis: Any = None, **kwargs: Any) -> Any:  # noqa: A003
+        return _ufunc(np.maximum, "reduce", (self,), {"axis": axis, **kwargs})
+
+    def min(self, axis: Any = None, **kwargs: Any) -> Any:  # noqa: A003
+        return _ufunc(np.minimum, "reduce", (self,), {"axis": axis, **kwargs})
+
+    def clip(self, a_min: Any = None, a_max: Any = None, **kwargs: Any) -> Any:
+        return _clip(self, a_min, a_max, **kwargs)
+
+
+class _Variable:
+    """One number of the function being recorded."""
+
+    __slots__ = ("boolean", "record", "slot")
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, record: _Recorder, slot: int, *, boolean: bool = False) -> None:
+        self.record = record
+        self.slot = slot
+        self.boolean = boolean
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        return _ufunc(ufunc, method, inputs, kwargs)
+
+    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:  # noqa: ARG002
+        return _function(func, args, kwargs)
+
+    def __repr__(self) -> str:
+        return f"<traced value {self.slot}>"
+
+    # What would decide on a value, or lose it, ends the trace.
+    def __bool__(self) -> bool:
+        raise Untraceable(_BRANCHED)
+
+    def __float__(self) -> float:
+        raise Untraceable(_TURNED)
+
+    def __int__(self) -> int:
+        raise Untraceable(_TURNED)
+
+    def __index__(self) -> int:
+        raise Untraceable(_TURNED)
+
+    def __complex__(self) -> complex:
+        raise Untraceable(_TURNED)
+
+    def __invert__(self) -> Any:
+        self._logical()
+        return self == 0
+
+    def _logical(self, other: Any = True) -> None:
+        # `&`, `|` and `~` of numbers are bit operations, which a tape has not.
+        for a in (self, other):
+            if not (a.boolean if isinstance(a, _Variable) else isinstance(a, bool | np.bool_)):
+                raise Untraceable("it computes with the bits of a number")
+
+    def __and__(self, other: Any) -> Any:
+        self._logical(other)
+        return _flag(self * other)
+
+    def __or__(self, other: Any) -> Any:
+        self._logical(other)
+        return (self + other) != 0
+
+    def __xor__(self, other: Any) -> Any:
+        self._logical(other)
+        return self != other
+
+    __rand__ = __and__
+    __ror__ = __or__
+    __rxor__ = __xor__
+
+    # Numbers and arrays as NumPy hands them over.
+    def item(self) -> "_Variable":
+        return self
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return ()
+
+    @property
+    def ndim(self) -> int:
+        return 0
+
+    @property
+    def real(self) -> "_Variable":
+        return self
+
+    @property
+    def T(self) -> "_Variable":  # noqa: N802
+        return self
+
+
+def _flag(a: _Variable) -> _Variable:
+    return _Variable(a.record, a.slot, boolean=True)
+
+
+def _operator(name: str, *, swapped: bool = False) -> Callable[[Any, Any], Any]:
+    def operate(self: Any, other: Any) -> Any:
+        if isinstance(other, np.ndarray) and other.ndim:
+            return _elementwise(name, (other, self) if swapped else (self, other))
+        try:
+            pair = (other, self) if swapped else (self, other)
+            if name in _SPLIT:
+                return _SPLIT[name](*pair)
+            return self.record.apply(name, *pair)
+        except Untraceable:
+            if isinstance(other, list | tuple):
+                return _elementwise(name, (np.asarray(other), self) if swapped else (self, np.asarray(other)))
+            raise
+
+    return operate
+
+
+def _unary(name: str) -> Callable[[Any], Any]:
+    def operate(self: Any) -> Any:
+        return _SPLIT[name](self) if name in _SPLIT else self.record.apply(name, self)
+
+    return operate
+
+
+for _symbol, _name in {
+    "add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "floordiv": "floor_divide",
+    "mod": "remainder", "pow": "power",
+}.items():  # fmt: skip
+    setattr(_Variable, f"__{_symbol}__", _operator(_name))
+    setattr(_Variable, f"__r{_symbol}__", _operator(_name, swapped=True))
+for _symbol, _name in {"lt": "less", "le": "less_equal", "eq": "equal", "ne": "not_equal"}.items():
+    setattr(_Variable, f"__{_symbol}__", _operator(_name))
+_Variable.__gt__ = _operator("less", swapped=True)  # type: ignore[attr-defined]
+_Variable.__ge__ = _operator("less_equal", swapped=True)  # type: ignore[attr-defined]
+for _symbol, _name in {"neg": "negative", "abs": "absolute", "pos": "positive", "floor": "floor", "ceil": "ceil",
+                       "trunc": "trunc"}.items():  # fmt: skip
+    setattr(_Variable, f"__{_symbol}__", _unary(_name))
+# NumPy's object loops call methods of the entries by the name of the function.
+for _name in (
+    "sqrt cbrt square reciprocal sign exp exp2 expm1 log log2 log10 log1p sin cos tan arcsin arccos arctan sinh cosh "
+    "tanh arcsinh arccosh arctanh rint deg2rad rad2deg radians degrees conjugate"
+).split():
+    setattr(_Variable, _name, _unary(_name))
+for _name in ("arctan2", "hypot", "fmod"):
+    setattr(_Variable, _name, _operator(_name))

@@ -1,0 +1,28 @@
+"""Taking data away never makes a Gaussian answer or a guaranteed box narrower."""
+
+import numpy as np
+import pytest
+from tests.cases import PAIRS, stochastic
+
+import halfwidth as hw
+
+SPREAD = [
+    (m, c)
+    for m, c in PAIRS
+    if isinstance(c.model, hw.Linear) and not stochastic(m) and c.model.w.known and c.model.e.known
+]
+
+
+@pytest.mark.parametrize(("method", "case"), SPREAD, ids=str)
+def test_a_longer_gap(method, case):
+    middle = case.record.t[len(case.record) // 2]
+    step = case.record.t[1] - case.record.t[0]
+    widths = []
+    for half in (2, 5, 9):
+        est = hw.estimate(case.model, case.record.without(middle - half * step, middle + half * step), method)
+        if est.spread is None:
+            pytest.skip("a point without a spread")
+        lo, hi = est.interval(0.9)
+        widths.append(hi - lo)
+    assert np.all(widths[1] >= widths[0] * (1 - 1e-9) - 1e-12)
+    assert np.all(widths[2] >= widths[1] * (1 - 1e-9) - 1e-12)

@@ -1,0 +1,39 @@
+"""The exported names, and nothing else."""
+
+import subprocess
+import sys
+
+import halfwidth as hw
+
+NAMES = """
+BadLog BadRecord BadShape BadValue Box Cloud DataQualityWarning Estimate Estimator ExtendedKalman Gaussian
+HalfwidthError KalmanFilter KalmanSmoother Learned Linear Missing Mixed Nonlinear Normal ParticleFilter Record
+Recursive Refused Status Uniform UnscentedKalman Unsolved __version__ estimate forecast from_continuous learn resume
+score simulate stream
+"""
+
+
+def test_exported_names():
+    assert sorted(hw.__all__) == sorted(NAMES.split())
+    for name in hw.__all__:
+        assert getattr(hw, name) is not None
+    assert set(dir(hw)) == set(hw.__all__)
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    assert not hasattr(hw, "Kalman")
+
+
+def test_importing_loads_no_optional_library():
+    heavy = ["scipy", "pandas", "polars", "pyarrow", "matplotlib", "narwhals", "typer", "highspy", "piqp"]
+    code = (
+        f"import sys, halfwidth; halfwidth.Linear; halfwidth.estimate; print([m for m in {heavy} if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_functions_keep_their_names_whatever_was_imported_first():
+    code = "import halfwidth.estimate, halfwidth.learn, halfwidth.score, halfwidth as hw; print(callable(hw.estimate), callable(hw.learn))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["True", "True"]

@@ -1,0 +1,38 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+import halfwidth as hw
+
+
+def test_normal_interval_is_the_two_sided_quantile():
+    lo, hi = hw.Normal([[1.0, 2.0]], [[[4.0, 0.0], [0.0, 1.0]]]).interval(0.95)
+    np.testing.assert_allclose(hi - lo, 2 * 1.959963984540054 * np.array([[2.0, 1.0]]))
+
+
+def test_box_is_its_own_interval():
+    box = hw.Box(-1, [1, 2])
+    assert box.interval(0.5)[1].tolist() == [1.0, 2.0]
+    assert not box.guaranteed
+    np.testing.assert_allclose(hw.Box([-np.inf, 0, -np.inf], [3, np.inf, np.inf]).mean, [3, 0, 0])
+
+
+@given(st.integers(0, 2**31), st.floats(0.05, 0.99))
+def test_cloud_interval_leaves_the_same_weight_on_either_side(seed, level):
+    rng = np.random.default_rng(seed)
+    points, weights = rng.standard_normal((3, 200, 2)), rng.random((3, 200))
+    weights /= weights.sum(axis=1, keepdims=True)
+    cloud = hw.Cloud(points, weights)
+    lo, hi = cloud.interval(level)
+    for end, out in ((lo, points < lo[:, None]), (hi, points > hi[:, None])):
+        share = np.sum(weights[..., None] * out, axis=1)
+        assert np.all(share <= 0.5 - 0.5 * level + 1e-9)
+        assert np.isin(end, points).all()
+    np.testing.assert_allclose(cloud.mean, np.einsum("tn,tni->ti", weights, points))
+
+
+def test_priors_can_be_drawn_from():
+    rng = np.random.default_rng(0)
+    draws = np.array([hw.Normal([1.0, 0.0], [[1.0, 0.5], [0.5, 2.0]]).sample(rng) for _ in range(4000)])
+    np.testing.assert_allclose(np.cov(draws.T), [[1.0, 0.5], [0.5, 2.0]], atol=0.15)
+    assert np.all(np.abs(hw.Box([-1, -2], [1, 2]).sample(rng)) <= [1, 2])
