@@ -11,6 +11,7 @@ ESTIMATORS: dict[str, str] = {
     "UnscentedKalman": "nonlinear",
     "ParticleFilter": "particle",
 }
+ESTIMATORS: dict[str, str] = {"BatchLP": "map"}
 
 
 def load(name: str) -> Any:

@@ -1,0 +1,598 @@
+"""BatchLP: states and unknown half-widths of uniform noise at once, by linear programming over a whole record.
+
+The joint posterior of a trajectory and the half-widths s = (q, r) is ``prod_j s_j^(-N_j)`` wherever every residual
+lies within its half-width and every state in its box, and 0 elsewhere; N_j is the number of rows of group j, seen
+outputs only. With the logarithm linearised, its maximum is the linear program
+
+    minimise  sum_j c_j s_j     subject to    |E x[t] - A x[t-1] - B u[t]| <= q,   |F y[t] - C x[t]| <= r,
+                                              lo <= x[t] <= hi,   floors <= (q, r) <= caps.
+
+Three things are added to the paper. The objective is **scaled**: c_j = N_j / sigma_j with sigma_j the group's noise
+level in a least-squares fit, so that metres and radians can be summed; the paper's plain sum is
+``objective="paper"``. The optimum is a **face**, not a point:
+inside a gap the path is free within the bounds that the worst step anywhere has set; by default the trajectory of
+least squares on that face is returned. And **what cannot be known is said**: half-widths that leave no trace in the
+data, directions of the state that no output sees, and, where bounds contradict the data, the rows that do so and the
+factor by which all half-widths would have to grow.
+
+The half-widths found are the smallest that explain the data, often exactly 0 for one of them, so they are no bounds of
+the noise to come: the estimate has no spread, and `interval` refuses.
+
+References
+----------
+Pavelková (2011), State estimation with missing data and bounded uncertainty, ÚTIA report 2296: eqs. (12), (15)-(19),
+algorithm 3.3.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.array import Array
+from halfwidth.errors import BadValue
+from halfwidth.methods._protocol import typed
+from halfwidth.methods._residuals import (
+    TRACE,
+    Reference,
+    Residuals,
+    reference,
+    residuals,
+    unseen_directions,
+)
+from halfwidth.model import Linear, Model
+from halfwidth.noise import Uniform
+from halfwidth.record import Record
+from halfwidth.result import Estimate, Status
+from halfwidth.solvers.lp import HIGHS, PIQP, Program, Solution, Solver, Verdict, solve
+from halfwidth.spread import Box
+
+_SOLVERS: dict[str, tuple[Solver, ...]] = {
+    "auto": (PIQP, HIGHS),
+    "piqp": (PIQP,),
+    "highs": (HIGHS,),
+}
+_STATUS = {
+    Verdict.OPTIMAL: Status.OK,
+    Verdict.REDUCED: Status.REDUCED,
+    Verdict.INFEASIBLE: Status.INFEASIBLE,
+}
+#: Share of sigma, or of itself if larger, by which an optimal half-width is widened for the least-squares stage.
+_RELAX = 1e-6
+#: Residuals, half-widths and excesses below this share of sigma count as 0.
+_ZERO = 1e-5
+#: Steps of majorise-minimise for the logarithmic objective.
+_ROUNDS = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchLP:
+    """States and unknown half-widths by linear programming, the whole record at once.
+
+    Parameters
+    ----------
+    objective : {"scaled", "paper", "log"}
+        ``"scaled"``: ``sum N_j s_j / sigma_j`` with N_j rows and scale sigma_j of each group, the same for every
+        choice of units. ``"paper"``: ``sum q + sum r`` as printed, which adds metres to radians. ``"log"``: ``sum N_j
+        log s_j`` by majorise-minimise from the scaled optimum; it needs ``at_least`` above 0 for every unknown
+        half-width, since it has no minimum otherwise.
+    point : {"least_squares", "optimal"}
+        Which trajectory of the optimal face: that of least squares in units of sigma, inside the optimal half-widths
+        widened by 1e-6 of sigma; or the one the solver happens to return.
+    grow_caps : bool
+        Where the caps ``at_most`` of unknown half-widths leave no trajectory, double them until one fits (step 7 of
+        the paper's algorithm); ``info["caps_grown"]`` says how often.
+    solver : {"auto", "piqp", "highs"}
+        "auto" asks PIQP first and HiGHS where its answer does not pass the check.
+
+    Notes
+    -----
+    The estimate has ``x``, ``q``, ``r``, no spread (`interval` refuses: minimal half-widths are no guarantee), and in
+    ``info``:
+
+    ==================  ======================================================================
+    x0                  state one step before the first row, (nx,)
+    objective           value of the objective
+    check               residuals and gap of the linear program by our own arithmetic, each relative
+    solver, iterations  who solved it
+    w, e                residuals (T, nx) and (T, ny); e is NaN where y is not seen
+    sigma               scale of each group, (nx + ny,)
+    rows, redundancy    rows of each group, and how many rows' worth of its noise show in the data
+    notes               what the numbers do not say themselves, as sentences
+    unobservable        directions of x0 that no output sees, (k, nx)
+    conflicts           if infeasible: the rows that cannot be kept, the worst first
+    inflation           if infeasible: factor on all half-widths that would reconcile them, or None
+    caps_grown          factor on the caps, 1 where they were wide enough
+    ==================  ======================================================================
+
+    An infeasible record still gets a trajectory: the one that fits with all half-widths inflated, or else the one of
+    least total excess.
+
+    Raises
+    ------
+    BadValue
+        If a setting is not one of those above.
+
+    Examples
+    --------
+    >>> import halfwidth as hw
+    >>> unknown = hw.Uniform.unknown(at_most=10.0)
+    >>> walk = hw.Linear([[1]], None, [[1]], unknown, unknown, None)
+    >>> est = hw.estimate(walk, hw.Record([0, 1, 2, 3], [0.0, 0.4, None, 1.2]), hw.BatchLP())
+    >>> est.x[:, 0].round(3)
+    array([0. , 0.4, 0.8, 1.2])
+    """
+
+    objective: Literal["scaled", "paper", "log"] = "scaled"
+    point: Literal["least_squares", "optimal"] = "least_squares"
+    grow_caps: bool = False
+    solver: Literal["auto", "piqp", "highs"] = "auto"
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("objective", ("scaled", "paper", "log")),
+            ("point", ("least_squares", "optimal")),
+            ("solver", tuple(_SOLVERS)),
+        ):
+            if getattr(self, name) not in allowed:
+                raise BadValue(f"`{name}` is {getattr(self, name)!r}, one of {', '.join(allowed)} was expected")
+
+    def refuses(self, model: Model) -> str | None:
+        """Return why the model cannot be taken, or None."""
+        if not isinstance(model, Linear):
+            return (
+                "`BatchLP` needs a linear model but the model is nonlinear"
+                "\nhint: linearise it, or use a method for nonlinear models"
+            )
+        for name, noise in (("w", model.w), ("e", model.e)):
+            if not isinstance(noise, Uniform):
+                kind = type(noise).__name__
+                return (
+                    f"`BatchLP` needs uniform noise but `{name}` is `{kind}`\nhint: {name}=Uniform.unknown(at_most=...)"
+                )
+        if not isinstance(model.x0, Box):
+            return "`BatchLP` needs a box as prior but `x0` is `Normal`\nhint: x0=Box(lo, hi), or None for no bounds"
+        if model.theta_entries:
+            entry = model.theta_entries[0]
+            return (
+                f"`BatchLP` needs known matrices but `{entry.matrix}[{entry.row}, {entry.column}]` is unknown"
+                "\nhint: give it a value, or use a method that estimates theta"
+            )
+        if model.loss is not None:
+            return "`BatchLP` takes lost outputs as NaN in the record but the model has a hidden loss\nhint: loss=None"
+        if self.objective == "log" and np.any(_unknown(model) & (_ends(model)[0] <= 0)):
+            return (
+                "`BatchLP(objective='log')` needs a floor above 0 for every unknown half-width: the logarithm has no"
+                " minimum at 0\nhint: Uniform.unknown(at_least=..., at_most=...)"
+            )
+        return None
+
+    def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
+        """Estimate states and half-widths of one record."""
+        assert isinstance(model, Linear)
+        rows = residuals(model, record)
+        floor, cap = _ends(model)
+        # A uniform noise of known half-width q has the standard deviation q / sqrt(3).
+        base = reference(rows, model, np.where(floor == cap, floor / math.sqrt(3.0), 0.0))
+        task = _Task.build(rows, base, model)
+        solvers = _SOLVERS[self.solver]
+        info: dict[str, Any] = {"caps_grown": 1.0}
+
+        found = self._minimise(task, solvers)
+        if found.verdict is Verdict.INFEASIBLE and self.grow_caps:
+            factor, _ = task.inflation(solvers, task.free)
+            if factor is not None:
+                # The doublings of the paper's loop in one go: the first power of two that fits.
+                info["caps_grown"] = 2.0 ** math.ceil(math.log2(factor * (1 + 1e-6)))
+                task = task.grown(info["caps_grown"])
+                found = self._minimise(task, solvers)
+        if found.verdict is Verdict.INFEASIBLE:
+            return self._infeasible(model, record, task, solvers, found, info)
+
+        status = _STATUS.get(found.verdict, Status.STALLED)
+        if found.x is None or not status.good:
+            info |= {"solver": found.solver, "notes": list(found.notes), "iterations": found.iterations}
+            info["message"] = f"{Status.STALLED.value}: {'; '.join(found.notes)}"
+            return self._estimate(model, record, task.clipped(base.X), None, Status.STALLED, info)
+
+        X, s = task.point(found.x), task.half_widths(found.x)
+        if self.point == "least_squares":
+            second = solve(task.squares(found.x), solvers)
+            if second.solved and second.x is not None:
+                X = task.clipped(base.X + base.column * second.x)
+                status = _STATUS[second.verdict] if status is Status.OK else status
+            else:
+                status = Status.REDUCED
+                info["message"] = "the least-squares stage failed, so this is the solver's own optimal trajectory"
+        s = task.enough(X, s)
+        info |= task.report(X, s, model, record, self._value(task, s), found)
+        if "message" not in info and info["notes"]:
+            info["message"] = "; ".join([status.value, *info["notes"]])
+        return self._estimate(model, record, X, s, status, info)
+
+    def _minimise(self, task: "_Task", solvers: Sequence[Solver]) -> Solution:
+        """Return the optimal point of the chosen objective."""
+        weight = task.weights("paper" if self.objective == "paper" else "scaled")
+        program = task.program(weight)
+        found = solve(program, solvers)
+        if self.objective != "log" or found.x is None:
+            return found
+        # The tangent of the logarithm lies above it, so each program lowers sum N log s.
+        count = task.rows.count / max(float(task.rows.count.max()), 1.0)
+        n = task.rows.M.shape[1]
+        s = np.maximum(found.x[n:], task.lowest)
+        for _ in range(_ROUNDS):
+            cost = np.where(task.free, count / np.where(task.free, s, 1.0), 0.0)
+            again = solve(replace(program, c=np.r_[np.zeros(n), cost / max(float(cost.max()), 1e-300)]), solvers)
+            if not again.solved or again.x is None:
+                break
+            last, s, found = s, np.maximum(again.x[n:], task.lowest), again
+            if np.max(np.abs(s - last) / np.where(task.free, last, 1.0), initial=0.0) < 1e-6:
+                break
+        return found
+
+    def _value(self, task: "_Task", s: Array) -> float:
+        """Return the objective in the units of its definition."""
+        there = task.rows.count > 0
+        if self.objective == "paper":
+            return float(s[there].sum())
+        if self.objective == "log":
+            pick = task.free & there
+            return float(task.rows.count[pick] @ np.log(s[pick]))
+        return float(task.weights("scaled") @ (s / task.base.sigma))
+
+    def _infeasible(
+        self,
+        model: Linear,
+        record: Record,
+        task: "_Task",
+        solvers: Sequence[Solver],
+        found: Solution,
+        info: dict[str, Any],
+    ) -> Estimate:
+        """Say which rows conflict, and what would reconcile them."""
+        factor, inflated = task.inflation(solvers, np.ones_like(task.free))
+        excess, least = task.elastic(solvers)
+        conflicts = [] if excess is None else task.conflicts(excess, model, record)
+        X = next((v for v in (inflated, least) if v is not None), task.base.X)
+        message = Status.INFEASIBLE.value
+        if conflicts:
+            first, last = min(c["t"] for c in conflicts), max(c["t"] for c in conflicts)
+            when = f"at t = {first:.9g} s" if first == last else f"between t = {first:.9g} s and t = {last:.9g} s"
+            message = f"{message} {when}"
+        if factor is not None:
+            message = f"{message}; they fit if all half-widths grow {_up(factor):g} times"
+        info |= {
+            "message": message,
+            "conflicts": conflicts,
+            "inflation": factor,
+            "solver": found.solver,
+            "iterations": found.iterations,
+            "notes": [],
+            "hint": "BatchLP(grow_caps=True), or make the outputs that info['conflicts'] names missing",
+        }
+        return self._estimate(model, record, task.clipped(X), None, Status.INFEASIBLE, info)
+
+    def _estimate(
+        self, model: Linear, record: Record, X: Array, s: Array | None, status: Status, info: dict[str, Any]
+    ) -> Estimate:
+        x = X.reshape(-1, model.nx)
+        info["x0"] = x[0].copy()
+        return Estimate(
+            record.t,
+            x[1:].copy(),
+            None,
+            status,
+            typed(self),
+            q=None if s is None else s[: model.nx].copy(),
+            r=None if s is None else s[model.nx :].copy(),
+            names=model.names.x,
+            labels=record.labels,
+            info=info,
+        )
+
+
+def _ends(model: Linear) -> tuple[Array, Array]:
+    """Return floors and caps of the half-widths (q, r), each (p,)."""
+    assert isinstance(model.w, Uniform)
+    assert isinstance(model.e, Uniform)
+    return (
+        np.r_[np.atleast_1d(model.w.at_least), np.atleast_1d(model.e.at_least)],
+        np.r_[np.atleast_1d(model.w.at_most), np.atleast_1d(model.e.at_most)],
+    )
+
+
+def _unknown(model: Linear) -> NDArray[np.bool_]:
+    floor, cap = _ends(model)
+    return np.asarray(floor < cap)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """The program in scaled form: ``X = X_ref + column xi``, ``s = sigma s^``, rows ``|M xi + rho| <= S s^``.
+
+    Parameters
+    ----------
+    M : (K, n) CSR array
+        Rows divided by their sigma, columns multiplied by theirs.
+    rho : (K,) array
+        Scaled residuals of the reference trajectory.
+    S : (K, p) CSR array
+    lo, hi : (n,) arrays
+        Box of xi.
+    lowest, highest : (p,) arrays
+        Floors and caps in units of sigma.
+    free : (p,) bool array
+        Half-widths to be found.
+    x_lo, x_hi : (n,) arrays
+        Box of X in its own units.
+    """
+
+    rows: Residuals
+    base: Reference
+    M: Any
+    rho: Array
+    S: Any
+    lo: Array
+    hi: Array
+    lowest: Array
+    highest: Array
+    free: NDArray[np.bool_]
+    x_lo: Array
+    x_hi: Array
+
+    @classmethod
+    def build(cls, rows: Residuals, base: Reference, model: Linear) -> "_Task":
+        """Scale the rows, boxes, floors and caps."""
+        import scipy.sparse as sp
+
+        assert isinstance(model.x0, Box)
+        scale = rows.S @ base.sigma
+        back = sp.diags_array(1.0 / scale)
+        box = model.bounds or Box(np.full(rows.nx, -np.inf), np.full(rows.nx, np.inf))
+        x_lo = np.r_[model.x0.lo, np.tile(box.lo, rows.T)]
+        x_hi = np.r_[model.x0.hi, np.tile(box.hi, rows.T)]
+        lo, hi = (x_lo - base.X) / base.column, (x_hi - base.X) / base.column
+        # A box without room is a fixed value: an interior point needs an interior.
+        narrow = np.flatnonzero(np.isfinite(lo) & np.isfinite(hi) & (hi - lo < 1e-9))
+        lo[narrow] = hi[narrow] = 0.5 * (lo[narrow] + hi[narrow])
+        floor, cap = _ends(model)
+        free = (floor < cap) & (rows.count > 0)
+        return cls(
+            rows,
+            base,
+            sp.csr_array(back @ rows.M @ sp.diags_array(base.column)),
+            rows.at(base.X) / scale,
+            sp.csr_array(back @ rows.S @ sp.diags_array(base.sigma)),
+            lo,
+            hi,
+            floor / base.sigma,
+            cap / base.sigma,
+            free,
+            x_lo,
+            x_hi,
+        )
+
+    def weights(self, objective: str) -> Array:
+        """Return the cost of each scaled half-width, (p,); 0 where it is known or has no row."""
+        if objective == "paper":
+            top = float(np.max(self.base.sigma[self.free], initial=0.0)) or 1.0
+            return np.where(self.free, self.base.sigma / top, 0.0)
+        count = self.rows.count
+        mean = float(count[count > 0].mean()) if np.any(count > 0) else 1.0
+        return np.where(self.free, count / mean, 0.0)
+
+    def grown(self, factor: float) -> "_Task":
+        """Return the task with the caps of unknown half-widths multiplied."""
+        return replace(self, highest=np.where(self.free, factor * self.highest, self.highest))
+
+    def program(self, weight: Array) -> Program:
+        """Return the linear program over (xi, s^)."""
+        import scipy.sparse as sp
+
+        n, p = self.M.shape[1], self.S.shape[1]
+        top = np.where(self.free, self.highest, self.lowest)
+        open_ = (self.S @ self.free.astype(float)) > 0
+        one, two = np.flatnonzero(open_), np.flatnonzero(~open_)
+        M, S, rho = self.M[one], self.S[one], self.rho[one]
+        known = self.S[two] @ self.lowest
+        none = np.full(one.size, np.inf)
+        return Program(
+            c=np.r_[np.zeros(n), weight],
+            G=sp.csr_array(
+                sp.vstack(
+                    [
+                        sp.hstack([M, S]),
+                        sp.hstack([M, -S]),
+                        sp.hstack([self.M[two], sp.csr_array((two.size, p))]),
+                    ]
+                )
+            ),
+            row_lo=np.r_[-rho, -none, -known - self.rho[two]],
+            row_hi=np.r_[none, -rho, known - self.rho[two]],
+            lo=np.r_[self.lo, self.lowest],
+            hi=np.r_[self.hi, top],
+            floor=1e-3,
+        )
+
+    def squares(self, v: Array) -> Program:
+        """Return the quadratic program of least squares inside the optimal half-widths, a little widened."""
+        import scipy.sparse as sp
+
+        s = v[self.M.shape[1] :]
+        wide = np.minimum(s + _RELAX * np.maximum(s, 1.0), np.maximum(self.highest, s))
+        limit = self.S @ np.where(self.free, wide, self.lowest)
+        return Program(
+            c=np.asarray(self.M.T @ self.rho),
+            G=self.M,
+            row_lo=-limit - self.rho,
+            row_hi=limit - self.rho,
+            lo=self.lo,
+            hi=self.hi,
+            P=sp.csr_array(self.M.T @ self.M),
+            floor=1e-3,
+        )
+
+    def inflation(self, solvers: Sequence[Solver], grow: NDArray[np.bool_]) -> tuple[float | None, Array | None]:
+        """Return the least common factor on the half-widths that fits a trajectory, and that trajectory.
+
+        The caps of unknown half-widths grow, and known ones where `grow` says so; half-widths without a cap bound
+        nothing.
+        """
+        import scipy.sparse as sp
+
+        limit = np.where(self.free, self.highest, self.lowest)
+        bounded = np.asarray(self.S @ np.isinf(limit).astype(float)) == 0
+        finite = np.where(np.isfinite(limit), limit, 0.0)
+        M, S, rho = self.M[bounded], self.S[bounded], self.rho[bounded]
+        growing, fixed = S @ (finite * grow), S @ (finite * ~grow)
+        if not np.any(growing > 0):
+            return None, None
+        unit = float(np.median(growing[growing > 0]))
+        column = sp.csr_array(growing[:, None] / unit)
+        none = np.full(rho.size, np.inf)
+        found = solve(
+            Program(
+                c=np.r_[np.zeros(self.M.shape[1]), 1.0],
+                G=sp.csr_array(sp.vstack([sp.hstack([M, column]), sp.hstack([M, -column])])),
+                row_lo=np.r_[-rho - fixed, -none],
+                row_hi=np.r_[none, fixed - rho],
+                lo=np.r_[self.lo, 0.0],
+                hi=np.r_[self.hi, np.inf],
+                floor=1e-3 * unit,
+            ),
+            solvers,
+        )
+        if not found.solved or found.x is None:
+            return None, None
+        return float(found.x[-1]) / unit, self.point(found.x)
+
+    def elastic(self, solvers: Sequence[Solver]) -> tuple[Array | None, Array | None]:
+        """Return the least total excess of the rows over their caps, (K,) in units of sigma, and its trajectory."""
+        import scipy.sparse as sp
+
+        n = self.M.shape[1]
+        limit = np.where(self.free, self.highest, self.lowest)
+        picked = np.flatnonzero(np.asarray(self.S @ np.isinf(limit).astype(float)) == 0)
+        M, rho, k = self.M[picked], self.rho[picked], picked.size
+        wide = self.S[picked] @ np.where(np.isfinite(limit), limit, 0.0)
+        unit, none = sp.eye_array(k), np.full(k, np.inf)
+        found = solve(
+            Program(
+                c=np.r_[np.zeros(n), np.ones(k)],
+                G=sp.csr_array(sp.vstack([sp.hstack([M, unit]), sp.hstack([M, -unit])])),
+                row_lo=np.r_[-wide - rho, -none],
+                row_hi=np.r_[none, wide - rho],
+                lo=np.r_[self.lo, np.zeros(k)],
+                hi=np.r_[self.hi, none],
+                floor=1e-3,
+            ),
+            solvers,
+        )
+        if not found.solved or found.x is None:
+            return None, None
+        excess = np.zeros(self.rho.size)
+        excess[picked] = found.x[n:]
+        return excess, self.point(found.x)
+
+    def clipped(self, X: Array) -> Array:
+        """Return the trajectory moved into its boxes."""
+        return np.clip(X, self.x_lo, self.x_hi)
+
+    def point(self, v: Array) -> Array:
+        """Return the trajectory X of a program's solution, in its own units."""
+        n = self.M.shape[1]
+        return self.clipped(self.base.X + self.base.column * v[:n])
+
+    def half_widths(self, v: Array) -> Array:
+        """Return the half-widths of a program's solution, in their own units."""
+        return self.base.sigma * np.clip(v[self.M.shape[1] :], self.lowest, self.highest)
+
+    def enough(self, X: Array, s: Array) -> Array:
+        """Return half-widths that hold the residuals of X: the largest of each group, between floor and cap."""
+        rho = np.abs(self.rows.at(X))
+        floor, cap = self.lowest * self.base.sigma, self.highest * self.base.sigma
+        if self.S.nnz == self.rho.size:
+            tight = self.rows.largest(rho)
+        else:
+            tight = s + self.rows.largest(np.maximum(rho - self.rows.S @ s, 0.0))
+        return np.where(self.free, np.clip(tight, floor, cap), floor)
+
+    def report(
+        self, X: Array, s: Array, model: Linear, record: Record, value: float, found: Solution
+    ) -> dict[str, Any]:
+        """Return what goes into `info` of a solved record."""
+        assert found.check is not None
+        rows, base = self.rows, self.base
+        nx, T = rows.nx, rows.T
+        rho = rows.at(X)
+        # A row that stands for several entries of e, because of an unseen correlated output, tells none of them.
+        e = np.full((T, rows.ny), np.nan)
+        k = T * nx + np.flatnonzero(np.diff(rows.S.indptr)[T * nx :] == 1)
+        e[rows.row[k], rows.group[k] - nx] = -rho[k]
+        names = [f"q[{n}]" for n in model.names.x] + [f"r[{n}]" for n in model.names.y]
+        share = np.where(rows.count > 0, base.redundancy / np.maximum(rows.count, 1.0), 0.0)
+        blind = unseen_directions(rows, model, record)
+        lost = self.free & (share <= TRACE)
+        unseen = _unknown(model) & (rows.count == 0)
+        zero = self.free & ~lost & (s <= _ZERO * base.sigma) & (self.lowest == 0)
+        low = self.free & ~lost & (self.lowest > 0) & (s <= self.lowest * base.sigma * (1 + 1e-6))
+        high = self.free & (s >= self.highest * base.sigma * (1 - 1e-6))
+        notes = []
+        for mask, what in (
+            (lost | unseen, "bound not identifiable"),
+            (zero, "half-width 0, which is a degenerate optimum and no bound of the noise"),
+            (low, "half-width on its floor"),
+            (high & ~lost, "half-width on its cap"),
+        ):
+            if mask.any():
+                notes.append(f"{what}: {', '.join(n for n, m in zip(names, mask, strict=True) if m)}")
+        if len(blind):
+            involved = np.abs(blind).max(axis=0) > 1e-6
+            notes.append("not observable: " + ", ".join(n for n, m in zip(model.names.x, involved, strict=True) if m))
+        return {
+            "objective": value,
+            "check": {
+                "primal": found.check.primal,
+                "dual": found.check.dual,
+                "gap": found.check.gap,
+                "complementarity": found.check.complementarity,
+            },
+            "solver": found.solver,
+            "iterations": found.iterations,
+            "w": rho[: T * nx].reshape(T, nx),
+            "e": e,
+            "sigma": base.sigma.copy(),
+            "rows": rows.count,
+            "redundancy": base.redundancy.copy(),
+            "notes": notes,
+            "unobservable": blind,
+        }
+
+    def conflicts(self, excess: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
+        """Return the rows that exceed their bounds, the worst first."""
+        rows = self.rows
+        order = np.argsort(-excess, kind="stable")
+        found = []
+        for k in order[excess[order] > _ZERO]:
+            j, t = int(rows.group[k]), int(rows.row[k])
+            state = j < rows.nx
+            found.append(
+                {
+                    "t": float(record.t[t]),
+                    "row": t,
+                    "kind": "state" if state else "output",
+                    "name": model.names.x[j] if state else model.names.y[j - rows.nx],
+                    "excess": float(excess[k] * (rows.S[[int(k)]] @ self.base.sigma)[0]),
+                }
+            )
+        return found
+
+
+def _up(factor: float) -> float:
+    """Round up to two digits."""
+    step = 10.0 ** (math.floor(math.log10(factor)) - 1)
+    return math.ceil(factor / step - 1e-9) * step

@@ -1,0 +1,1 @@
+"""Solvers, one file a problem class, one adapter a library."""

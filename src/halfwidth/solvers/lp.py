@@ -1,0 +1,728 @@
+"""Linear and convex quadratic programs: a library solves, and nothing is believed that we have not checked.
+
+::
+
+    minimise  x'P x / 2 + c'x     subject to     row_lo <= G x <= row_hi,   lo <= x <= hi
+
+`solve(program)` balances rows and columns by powers of two, asks the solvers in turn and judges
+what each of them claims with our own arithmetic. A point is **optimal** only if rows and boxes
+hold, the reduced costs
+
+    d = c + P x - G'z
+
+have the signs that the boxes allow, and the dual objective meets the primal one, all within 1e-7
+of the balanced program. A program is **infeasible** only with a Farkas certificate: multipliers z
+of the rows whose combination z'G x stays below what the rows demand wherever x is in its box;
+where no solver hands one over, the multipliers of the elastic program (least total violation of
+the rows, always solvable, judged the same way) are one. It is **unbounded** only with a feasible
+point and a direction of descent that no row stops. Otherwise the next solver is asked, and in the
+end the verdict says `FAILED`, or `REDUCED` for a point that is good to 1e-6 only. So a sloppy,
+broken or lying solver can cost time, never a wrong answer.
+
+Adding a solver: write a function from a `Program` to a `Claim` and put ``Solver(name, function)``
+into the tuple given to `solve`. Its multipliers follow the sign above: z > 0 prices a row at its
+lower end, z < 0 at its upper end. With ``balanced=False`` it is given the program as it was built,
+in particular `Program.chain`, the time structure that a structured solver exploits and the others
+ignore; it returns None where it does not know the structure. The answer is judged like any other.
+
+References
+----------
+Farkas certificates and weak duality: Boyd & Vandenberghe (2004), Convex Optimization, 5.5, 5.8.
+Balancing: Ruiz (2001), A scaling algorithm to equilibrate both rows and columns norms in matrices.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from halfwidth.array import Array
+from halfwidth.errors import BadShape, BadValue
+
+TOLERANCE = 1e-7
+REDUCED = 1e-6
+
+# Below this share of its own terms, or of the balanced cost scale, the objective is compared absolutely.
+_FLOOR, _TINY = 1e-6, 1e-9
+# A row's violation is judged relative to its terms plus this.
+_SMALL = 1e-4
+# A Farkas certificate excludes every x within this many times the program's own size.
+_REACH = 1e12
+
+
+class Verdict(Enum):
+    """What has been proved of a program."""
+
+    OPTIMAL = "optimal"
+    REDUCED = "optimal, but only to reduced accuracy"
+    INFEASIBLE = "infeasible"
+    UNBOUNDED = "unbounded"
+    FAILED = "no solver gave an answer that passed the check"
+
+
+class Scale(NamedTuple):
+    """Powers of two that balance a program: ``x = size col x^``, ``z = cost row z^``."""
+
+    row: Array
+    col: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """``min x'P x / 2 + c'x`` with ``row_lo <= G x <= row_hi`` and ``lo <= x <= hi``.
+
+    Parameters
+    ----------
+    c : (n,) array
+    G : (m, n) scipy.sparse CSR array
+    row_lo, row_hi : (m,) arrays
+        Infinite where a side is free; equal where the row is an equation.
+    lo, hi : (n,) arrays
+    P : (n, n) scipy.sparse array, optional
+        Symmetric positive semidefinite.
+    floor : float
+        Size of the objective below which it counts as 0; its gap is judged relative to itself plus
+        this.
+    chain : object, optional
+        The time structure behind the rows, for solvers that exploit it.
+    scale : Scale, optional
+        Found on construction; `dataclasses.replace` keeps it, so costs and bounds change at no
+        cost.
+
+    Raises
+    ------
+    BadShape, BadValue
+        If sizes differ, a number is NaN, or a cost or coefficient is infinite.
+    """
+
+    c: Array
+    G: Any
+    row_lo: Array
+    row_hi: Array
+    lo: Array
+    hi: Array
+    P: Any = None
+    floor: float = 0.0
+    chain: object = None
+    scale: Scale | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        m, n = self.G.shape
+        for name, size in (("c", n), ("row_lo", m), ("row_hi", m), ("lo", n), ("hi", n)):
+            value = getattr(self, name)
+            if value.shape != (size,):
+                raise BadShape(f"`{name}` has shape {value.shape}, ({size},) was expected from `G`")
+            if np.isnan(value).any():
+                raise BadValue(f"`{name}` holds NaN at entry {int(np.argmax(np.isnan(value)))}")
+        if not (np.isfinite(self.c).all() and np.isfinite(self.G.data).all()):
+            raise BadValue("`c` or `G` holds a number that is not finite")
+        if self.P is not None and self.P.shape != (n, n):
+            raise BadShape(f"`P` has shape {self.P.shape}, ({n}, {n}) was expected from `G`")
+        if self.scale is None:
+            object.__setattr__(self, "scale", _balance(self.G))
+
+    def objective(self, x: Array) -> float:
+        """Return ``x'P x / 2 + c'x``."""
+        quadratic = 0.0 if self.P is None else 0.5 * float(x @ (self.P @ x))
+        return float(self.c @ x) + quadratic
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What a solver says, unchecked.
+
+    Parameters
+    ----------
+    verdict : Verdict
+    x : (n,) array or None
+    z : (m,) array or None
+        Row multipliers, ``c + P x = G'z + d``; of an infeasible program the multipliers of a proof,
+        if known.
+    ray : (n,) array or None
+        Direction of descent of an unbounded program.
+    iterations : int
+    """
+
+    verdict: Verdict
+    x: Array | None = None
+    z: Array | None = None
+    ray: Array | None = None
+    iterations: int = 0
+
+
+class Solver(NamedTuple):
+    """A library behind its adapter."""
+
+    name: str
+    run: Callable[[Program], Claim | None]
+    balanced: bool = True
+
+
+@dataclass(frozen=True)
+class Check:
+    """How far a point is from optimal, in units of the balanced program; 0 for an exact answer.
+
+    Parameters
+    ----------
+    primal : float
+        Largest violation of a row, relative to 1e-4 + the size of its terms; boxes hold exactly.
+    dual : float
+        Largest reduced cost of forbidden sign, relative to 1 + the size of its terms.
+    gap : float
+        |primal - dual objective| plus the first-order effect of all violations on the objective,
+        relative to the objective.
+    complementarity : float
+        Largest product of a multiplier and the slack of its row or box, likewise.
+    """
+
+    primal: float
+    dual: float
+    gap: float
+    complementarity: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of the four."""
+        return max(self.primal, self.dual, self.gap, self.complementarity)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A checked answer, in the units of the program.
+
+    Parameters
+    ----------
+    verdict : Verdict
+    x, z : (n,) and (m,) arrays or None
+        Point inside its box and row multipliers; of an infeasible program x is None and z the
+        Farkas certificate.
+    objective : float
+        `inf` if infeasible, `-inf` if unbounded or unknown; never NaN.
+    check : Check or None
+    solver : str
+        Who found it.
+    iterations : int
+    notes : tuple of str
+        What was tried before, and how it failed.
+    """
+
+    verdict: Verdict
+    x: Array | None
+    z: Array | None
+    objective: float
+    check: Check | None
+    solver: str
+    iterations: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def solved(self) -> bool:
+        """Whether `x` is an optimal point, perhaps to reduced accuracy."""
+        return self.verdict in (Verdict.OPTIMAL, Verdict.REDUCED)
+
+
+class _Found(NamedTuple):
+    """A judged answer in the units of the balanced program."""
+
+    verdict: Verdict
+    x: Array | None
+    z: Array | None
+    check: Check | None
+    solver: str
+    iterations: int
+
+
+def solve(program: Program, solvers: Sequence[Solver] | None = None) -> Solution:
+    """Solve a program and prove the answer.
+
+    Parameters
+    ----------
+    program : Program
+    solvers : sequence of Solver, optional
+        Asked in this order until one answer passes; PIQP, then HiGHS, unless given.
+
+    Returns
+    -------
+    Solution
+    """
+    solvers = (PIQP, HIGHS) if solvers is None else solvers
+    if np.any(program.lo > program.hi) or np.any(program.row_lo > program.row_hi):
+        empty = ("presolve: a box is empty",)
+        return Solution(Verdict.INFEASIBLE, None, None, np.inf, None, "presolve", 0, empty)
+    scaled = _Scaled(program)
+    notes: list[str] = []
+    found = scaled.ask(solvers, notes)
+    if found.verdict in (Verdict.FAILED, Verdict.REDUCED):
+        proof = _elastic_proof(scaled.program, solvers, notes)
+        found = found if proof is None else proof
+    x = None if found.x is None else np.clip(scaled.x * found.x, program.lo, program.hi)
+    return Solution(
+        found.verdict,
+        x,
+        None if found.z is None else scaled.z * found.z,
+        _objective(program, found.verdict, x),
+        found.check,
+        found.solver,
+        found.iterations,
+        tuple(notes),
+    )
+
+
+def judge(program: Program, x: Array, z: Array) -> tuple[Array, Array, Check]:
+    """Measure how far a point is from optimal; trusts nothing but the program.
+
+    Parameters
+    ----------
+    program : Program
+        Balanced, so that 1 is an ordinary size.
+    x, z : (n,) and (m,) arrays
+
+    Returns
+    -------
+    x, z : arrays
+        Moved where they must be: x into [lo, hi], z to the sign that a free side allows.
+    check : Check
+    """
+    x, z = np.clip(x, program.lo, program.hi), _signed(program, z)
+    with np.errstate(over="ignore", invalid="ignore"):
+        value = program.G @ x
+        Px = np.zeros_like(x) if program.P is None else program.P @ x
+        d = program.c + Px - program.G.T @ z
+        terms = np.abs(program.c) + np.abs(Px) + abs(program.G).T @ np.abs(z)
+
+        broken = np.maximum(np.maximum(program.row_lo - value, value - program.row_hi), 0.0)
+        wrong = np.maximum(d, 0.0) * np.isneginf(program.lo)
+        wrong += np.maximum(-d, 0.0) * np.isposinf(program.hi)
+
+        primal = float(0.5 * x @ Px + program.c @ x)
+        price = _price(z, program.row_lo, program.row_hi) + _price(d, program.lo, program.hi)
+        dual = float(price - 0.5 * x @ Px)
+        unit = max(_TINY, program.floor, _FLOOR * float(np.abs(program.c) @ np.abs(x))) + abs(primal)
+        off = abs(primal - dual) + float(broken @ np.abs(z)) + float(wrong @ np.abs(x))
+        slack = max(
+            _largest_product(z, value, program.row_lo, program.row_hi),
+            _largest_product(d, x, program.lo, program.hi),
+        )
+        check = Check(
+            primal=_largest(broken / (_SMALL + abs(program.G) @ np.abs(x))),
+            dual=_largest(wrong / (1.0 + terms)),
+            gap=_no_nan(off / unit),
+            complementarity=_no_nan(slack / unit),
+        )
+    return x, z, check
+
+
+def certifies(program: Program, z: Array) -> bool:
+    """Say whether z proves that no x within reach satisfies the rows and the box.
+
+    The rows demand ``z'G x >= z+'row_lo - z-'row_hi``. The certificate holds if the largest value
+    of ``z'G x`` over the box stays below that by more than the violation a point is allowed.
+    """
+    z = _signed(program, z)
+    top = _largest(np.abs(z))
+    if not 0.0 < top < np.inf:
+        return False
+    z = z / top
+    v = program.G.T @ z
+    # On a side without a box rounding leaves a small coefficient: it is charged at the reach.
+    hi = np.where(np.isfinite(program.hi), program.hi, _REACH)
+    lo = np.where(np.isfinite(program.lo), program.lo, -_REACH)
+    supply = float(np.maximum(v, 0.0) @ hi + np.minimum(v, 0.0) @ lo)
+    ends = np.where(z == 0.0, 0.0, np.where(z > 0, program.row_lo, program.row_hi))
+    allowed = TOLERANCE * float(np.abs(z) @ (1.0 + np.abs(ends)))
+    return bool(float(z @ ends) - supply > allowed)
+
+
+def _proof(program: Program, z: Array) -> Array | None:
+    """Return multipliers that certify infeasibility, z itself or z cleaned of its rounding, or None.
+
+    An interior point leaves ``G'z`` a little off 0 where x has no box. The correction of least relative size, found by
+    least squares with the weights z^2, keeps the signs.
+    """
+    import scipy.sparse as sp
+    from scipy.sparse.linalg import splu
+
+    if certifies(program, z):
+        return z
+    z = _signed(program, z)
+    top = _largest(np.abs(z))
+    free = np.flatnonzero(np.isneginf(program.lo) | np.isposinf(program.hi))
+    if not 0.0 < top < np.inf or free.size == 0:
+        return None
+    z = np.where(np.abs(z) > 1e-9 * top, z, 0.0) / top
+    G = program.G[:, free]
+    half = np.isfinite(program.lo[free]) | np.isfinite(program.hi[free])
+    for _ in range(3):
+        v = G.T @ z
+        # A side with a box may be priced: only the part that meets no box has to vanish.
+        allowed = half & (np.where(np.isfinite(program.lo[free]), -v, v) >= 0.0)
+        W = sp.diags_array(z**2)
+        H = sp.csc_matrix(G.T @ W @ G)
+        ridge = 1e-12 * max(float(H.diagonal().max(initial=0.0)), 1e-300)
+        step = splu(sp.csc_matrix(H + ridge * sp.eye(free.size))).solve(np.where(allowed, 0.0, v))
+        z = _signed(program, z - W @ (G @ step))
+        if certifies(program, z):
+            return z
+    return None
+
+
+def _descends(program: Program, ray: Array) -> bool:
+    """Say whether the objective falls for ever along a ray that no row or box stops."""
+    ray = np.where(np.isfinite(program.lo), np.maximum(ray, 0.0), ray)
+    ray = np.where(np.isfinite(program.hi), np.minimum(ray, 0.0), ray)
+    size = np.abs(ray)
+    if not 0.0 < _largest(size) < np.inf:
+        return False
+    move, rounding = program.G @ ray, 1e-11 * (abs(program.G) @ size)
+    stopped = np.any((move < -rounding) & np.isfinite(program.row_lo)) or np.any(
+        (move > rounding) & np.isfinite(program.row_hi)
+    )
+    flat = program.P is None or np.all(np.abs(program.P @ ray) <= 1e-12 * (abs(program.P) @ size))
+    return bool(not stopped and flat and program.c @ ray < -TOLERANCE * (np.abs(program.c) @ size))
+
+
+def _elastic_proof(program: Program, solvers: Sequence[Solver], notes: list[str]) -> _Found | None:
+    """Return a Farkas certificate from the least total violation of the rows, or None."""
+    import scipy.sparse as sp
+
+    m, n = program.G.shape
+    up = np.flatnonzero(np.isfinite(program.row_lo))
+    down = np.flatnonzero(np.isfinite(program.row_hi))
+    k = up.size + down.size
+    if k == 0:
+        return None
+    sign, row = np.r_[np.ones(up.size), -np.ones(down.size)], np.r_[up, down]
+    lift = sp.csr_array((sign, (row, np.arange(k))), shape=(m, k))
+    elastic = _Scaled(
+        Program(
+            c=np.r_[np.zeros(n), np.ones(k)],
+            G=sp.csr_array(sp.hstack([program.G, lift])),
+            row_lo=program.row_lo,
+            row_hi=program.row_hi,
+            lo=np.r_[program.lo, np.zeros(k)],
+            hi=np.r_[program.hi, np.full(k, np.inf)],
+        )
+    )
+    found = elastic.ask([s for s in solvers if s.balanced], notes)
+    z = None if found.z is None else _proof(program, elastic.z * found.z)
+    if z is None:
+        return None
+    return _Found(Verdict.INFEASIBLE, None, z, None, f"{found.solver}, elastic", found.iterations)
+
+
+# --- balancing ------------------------------------------------------------------------------------
+
+
+def _balance(G: Any, rounds: int = 8) -> Scale:
+    """Return powers of two that bring the largest entry of every row and column near 1."""
+    import scipy.sparse as sp
+
+    m, n = G.shape
+    if G.nnz == 0:
+        return Scale(np.ones(m), np.ones(n))
+    csr = sp.csr_array(G, copy=True)
+    csr.eliminate_zeros()
+    size = np.log2(np.abs(csr.data))
+    i, j = np.repeat(np.arange(m), np.diff(csr.indptr)), csr.indices
+    by_column = np.argsort(j, kind="stable")
+    rows, row_at = np.unique(i, return_index=True)
+    cols, col_at = np.unique(j[by_column], return_index=True)
+    r, c = np.zeros(m), np.zeros(n)
+    for _ in range(rounds):
+        now = size + r[i] + c[j]
+        r[rows] -= 0.5 * np.maximum.reduceat(now, row_at)
+        c[cols] -= 0.5 * np.maximum.reduceat(now[by_column], col_at)
+    return Scale(np.exp2(np.clip(np.round(r), -500, 500)), np.exp2(np.clip(np.round(c), -500, 500)))
+
+
+class _Scaled:
+    """A program beside its balanced twin, whose answers it can be asked for.
+
+    ``x`` and ``z`` are the factors from the balanced units back to the program's.
+    """
+
+    def __init__(self, original: Program) -> None:
+        import scipy.sparse as sp
+
+        assert original.scale is not None
+        row, col = original.scale
+        G = sp.csr_array(original.G, copy=True)
+        G.data *= np.repeat(row, np.diff(G.indptr)) * col[G.indices]
+        row_lo, row_hi = original.row_lo * row, original.row_hi * row
+        lo, hi = original.lo / col, original.hi / col
+        # The typical end sets the size: row ends first, boxes where every row end is 0 or free.
+        size = 1.0
+        for ends in (np.r_[row_lo, row_hi], np.r_[lo, hi]):
+            there = np.abs(ends[np.isfinite(ends) & (ends != 0.0)])
+            if there.size:
+                size = float(np.exp2(np.round(np.log2(np.median(there)))))
+                break
+        c, P = original.c * col, None
+        if original.P is not None:
+            D = sp.diags_array(col)
+            P = sp.csr_array(D @ original.P @ D) * size
+        top = max(_largest(np.abs(c)), 0.0 if P is None else _largest(np.abs(P.data)))
+        cost = float(np.exp2(np.round(np.log2(top)))) if 0.0 < top < np.inf else 1.0
+        self.original = original
+        self.program = Program(
+            c / cost,
+            G,
+            row_lo / size,
+            row_hi / size,
+            lo / size,
+            hi / size,
+            None if P is None else P / cost,
+            max(_TINY, original.floor / (size * cost)),
+            original.chain,
+            Scale(np.ones(row.size), np.ones(col.size)),
+        )
+        self.x, self.z = size * col, cost * row
+
+    def ask(self, solvers: Sequence[Solver], notes: list[str]) -> _Found:
+        """Ask the solvers in turn; return the first proved answer, else the best point seen."""
+        best = _Found(Verdict.FAILED, None, None, None, "none", 0)
+        for solver in solvers:
+            try:
+                claim = solver.run(self.program if solver.balanced else self.original)
+            except Exception as error:  # a library that breaks is one more that gave no answer
+                notes.append(f"{solver.name}: raised {type(error).__name__}: {error}")
+                continue
+            if claim is None:
+                continue
+            back_x, back_z = (1.0, 1.0) if solver.balanced else (self.x, self.z)
+            x = _vector(claim.x, self.program.c.size, back_x)
+            z = _vector(claim.z, self.program.row_lo.size, back_z)
+            ray = _vector(claim.ray, self.program.c.size, back_x)
+            found = self._believe(claim, x, z, ray, solver, solvers, notes)
+            if found.verdict not in (Verdict.FAILED, Verdict.REDUCED):
+                return found
+            if best.check is None or (found.check is not None and found.check.worst < best.check.worst):
+                best = found
+        return best
+
+    def _believe(
+        self,
+        claim: Claim,
+        x: Array | None,
+        z: Array | None,
+        ray: Array | None,
+        solver: Solver,
+        solvers: Sequence[Solver],
+        notes: list[str],
+    ) -> _Found:
+        """Return what a claim proves, whatever it says."""
+        program, count = self.program, int(claim.iterations)
+        found = _Found(Verdict.FAILED, None, None, None, solver.name, count)
+        if x is not None and z is not None:
+            x, z, check = judge(program, x, z)
+            if check.worst <= TOLERANCE:
+                return _Found(Verdict.OPTIMAL, x, z, check, solver.name, count)
+            verdict = Verdict.REDUCED if check.worst <= REDUCED else Verdict.FAILED
+            found = _Found(verdict, x, z, check, solver.name, count)
+            seen = f"its point is off by {check.worst:.1e}"
+        else:
+            seen = "it gave no usable point"
+        if z is not None and claim.verdict is not Verdict.OPTIMAL:
+            proof = _proof(program, z)
+            if proof is not None:
+                return _Found(Verdict.INFEASIBLE, None, proof, None, solver.name, count)
+        if ray is not None and _descends(program, ray):
+            free = _Scaled(replace(program, c=np.zeros_like(program.c), P=None))
+            if free.ask(solvers, []).verdict is Verdict.OPTIMAL:
+                return _Found(Verdict.UNBOUNDED, None, None, None, solver.name, count)
+        notes.append(f"{solver.name}: said {claim.verdict.name}, {seen}")
+        return found
+
+
+# --- small pieces ---------------------------------------------------------------------------------
+
+
+def _objective(program: Program, verdict: Verdict, x: Array | None) -> float:
+    if verdict is Verdict.INFEASIBLE:
+        return float("inf")
+    return float("-inf") if x is None else program.objective(x)
+
+
+def _vector(value: Array | None, n: int, unit: Array | float) -> Array | None:
+    """Return a finite float vector of size n in the given units, or None for anything else."""
+    if value is None:
+        return None
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return array / unit if array.shape == (n,) and np.isfinite(array).all() else None
+
+
+def _signed(program: Program, z: Array) -> Array:
+    """Drop the part of the multipliers that prices a free side of its row."""
+    z = np.where(np.isfinite(program.row_lo), z, np.minimum(z, 0.0))
+    return np.where(np.isfinite(program.row_hi), z, np.maximum(z, 0.0))
+
+
+def _price(z: Array, lo: Array, hi: Array) -> float:
+    """Return ``z+'lo - z-'hi`` over the finite ends."""
+    ends = np.where(z > 0, lo, hi)
+    return float(z @ np.where(np.isfinite(ends), ends, 0.0))
+
+
+def _largest_product(z: Array, value: Array, lo: Array, hi: Array) -> float:
+    """Return the largest |z| times the distance to the end that it prices, over finite ends."""
+    ends = np.where(z > 0, lo, hi)
+    return _largest(np.abs(z) * np.abs(value - np.where(np.isfinite(ends), ends, value)))
+
+
+def _largest(values: Array) -> float:
+    """Return the largest entry, 0 of nothing, and infinity where one is NaN."""
+    return _no_nan(float(np.max(values, initial=0.0)))
+
+
+def _no_nan(value: float) -> float:
+    return value if value == value else float("inf")
+
+
+# --- adapters: one function a library -------------------------------------------------------------
+
+
+def _piqp(program: Program) -> Claim:
+    """Interior point with proximal multipliers: fast on sparse programs, LP and QP alike."""
+    import piqp
+    import scipy.sparse as sp
+
+    m, n = program.G.shape
+    # Fixed variables leave an interior point no interior: they are substituted.
+    fixed = program.lo == program.hi
+    keep = np.flatnonzero(~fixed)
+    base = np.where(fixed, program.lo, 0.0)
+    shift = program.G @ base
+    lo, hi = program.row_lo - shift, program.row_hi - shift
+    equal = program.row_lo == program.row_hi
+    rows = np.flatnonzero((np.isfinite(lo) | np.isfinite(hi)) & ~equal)
+    equations = np.flatnonzero(equal)
+    G = program.G[:, keep] if keep.size < n else program.G
+    P = sp.csc_matrix((keep.size, keep.size))
+    c = program.c[keep]
+    if program.P is not None:
+        c = c + (program.P @ base)[keep]
+        P = sp.csc_matrix(program.P[keep][:, keep])
+
+    solver = piqp.SparseSolver()
+    solver.settings.eps_abs = 1e-10
+    solver.settings.eps_rel = 1e-10
+    solver.settings.eps_duality_gap_abs = 1e-2 * TOLERANCE * max(_TINY, program.floor)
+    solver.settings.eps_duality_gap_rel = 1e-10
+    solver.setup(
+        P,
+        c,
+        sp.csc_matrix(G[equations]) if equations.size else None,
+        lo[equations] if equations.size else None,
+        sp.csc_matrix(G[rows]) if rows.size else None,
+        lo[rows] if rows.size else None,
+        hi[rows] if rows.size else None,
+        program.lo[keep],
+        program.hi[keep],
+    )
+    status = solver.solve()
+    answer = solver.result
+    x, z = base.copy(), np.zeros(m)
+    x[keep] = answer.x
+    if rows.size:
+        z[rows] = answer.z_l - answer.z_u
+    if equations.size:
+        z[equations] = -answer.y
+    verdict = {
+        piqp.PIQP_SOLVED: Verdict.OPTIMAL,
+        piqp.PIQP_PRIMAL_INFEASIBLE: Verdict.INFEASIBLE,
+        piqp.PIQP_DUAL_INFEASIBLE: Verdict.UNBOUNDED,
+    }.get(status, Verdict.FAILED)
+    return Claim(verdict, x, z, np.where(fixed, 0.0, x), int(answer.info.iter))
+
+
+def highs(*, solver: str = "choose", time_limit: float = 120.0) -> Solver:
+    """Return HiGHS as a solver, the reference: slower than PIQP, with vertices and proofs.
+
+    Parameters
+    ----------
+    solver : {"choose", "simplex", "ipm"}
+    time_limit : float
+        Seconds after which it gives up.
+    """
+
+    def run(program: Program) -> Claim:
+        import highspy
+
+        kind = highspy.HighsModelStatus
+        engine: Any = highspy.Highs()  # type: ignore[no-untyped-call]
+        for option, value in (
+            ("output_flag", False),
+            ("presolve", "off"),  # it prints on stdout, and decides without a proof
+            ("solver", solver),
+            ("threads", 1),
+            ("time_limit", float(time_limit)),
+            ("primal_feasibility_tolerance", 1e-9),
+            ("dual_feasibility_tolerance", 1e-9),
+            ("qp_regularization_value", 1e-10),
+        ):
+            engine.setOptionValue(option, value)
+        engine.passModel(_highs_model(program))
+        engine.run()
+        status = engine.getModelStatus()
+        unproved = (kind.kInfeasible, kind.kUnbounded, kind.kUnboundedOrInfeasible)
+        if status in unproved and program.P is None:
+            # Presolve decides without a proof; the simplex method alone ends with one.
+            engine.setOptionValue("presolve", "off")
+            engine.setOptionValue("solver", "simplex")
+            engine.clearSolver()
+            engine.run()
+            status = engine.getModelStatus()
+        info = engine.getInfo()
+        count = max(0, info.simplex_iteration_count, info.ipm_iteration_count, info.qp_iteration_count)
+        if status == kind.kInfeasible:
+            _, there, ray = engine.getDualRay()
+            return Claim(Verdict.INFEASIBLE, z=np.array(ray) if there else None, iterations=count)
+        if status == kind.kUnbounded:
+            _, there, ray = engine.getPrimalRay()
+            return Claim(Verdict.UNBOUNDED, ray=np.array(ray) if there else None, iterations=count)
+        answer = engine.getSolution()
+        good = status in (kind.kOptimal, kind.kModelEmpty)
+        return Claim(
+            Verdict.OPTIMAL if good else Verdict.FAILED,
+            np.array(answer.col_value),
+            np.array(answer.row_dual),
+            iterations=count,
+        )
+
+    return Solver("highs", run)
+
+
+def _highs_model(program: Program) -> Any:
+    import highspy
+    import scipy.sparse as sp
+
+    m, n = program.G.shape
+    model, lp = highspy.HighsModel(), highspy.HighsLp()
+    lp.num_col_, lp.num_row_ = n, m
+    lp.col_cost_ = program.c
+    lp.col_lower_, lp.col_upper_ = program.lo, program.hi
+    lp.row_lower_, lp.row_upper_ = program.row_lo, program.row_hi
+    lp.a_matrix_.format_ = highspy.MatrixFormat.kRowwise
+    lp.a_matrix_.num_col_, lp.a_matrix_.num_row_ = n, m
+    lp.a_matrix_.start_ = program.G.indptr.astype(np.int32)
+    lp.a_matrix_.index_ = program.G.indices.astype(np.int32)
+    lp.a_matrix_.value_ = program.G.data
+    model.lp_ = lp
+    if program.P is not None:
+        lower = sp.csc_array(sp.tril(program.P))
+        lower.sort_indices()
+        model.hessian_.dim_ = n
+        model.hessian_.format_ = highspy.HessianFormat.kTriangular
+        model.hessian_.start_ = lower.indptr.astype(np.int32)
+        model.hessian_.index_ = lower.indices.astype(np.int32)
+        model.hessian_.value_ = lower.data
+    return model
+
+
+PIQP = Solver("piqp", _piqp)
+HIGHS = highs()
