@@ -3,6 +3,7 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 
+#include <algorithm>
 #include <cstdlib>
 #include <memory>
 #include <new>
@@ -66,9 +67,21 @@ void need(bool ok, const char* what) {
 
 const double* data_of(const Maybe& a) { return a ? a->data() : nullptr; }
 
-nb::tuple lp_solve(Maybe E, Array A, Array C, Maybe G, Array bx, Array by, Mask seen, Maybe lo, Maybe hi, Maybe x0_lo,
-                   Maybe x0_hi, Maybe theta_lo, Maybe theta_hi, Index group, Array h, Array c, Array floor, Array cap,
-                   Maybe slack, int point, double tol, double central_gap, int max_iter, bool multipliers) {
+struct Given {
+    Maybe E;
+    Array A, C;
+    Maybe G;
+    Array bx, by;
+    Mask seen;
+    Maybe lo, hi, x0_lo, x0_hi, theta_lo, theta_hi;
+    Index group;
+    Array h, c, floor, cap;
+    Maybe slack;
+};
+
+hw::LpProblem problem(const Given& g) {
+    const auto& [E, A, C, G, bx, by, seen, lo, hi, x0_lo, x0_hi, theta_lo, theta_hi, group, h, c, floor, cap, slack] = g;
+
     hw::LpProblem lp{};
     need(bx.ndim() == 2 && by.ndim() == 2 && A.ndim() >= 2 && C.ndim() >= 2, "bx (T,n), by (T,m), A, C expected");
     lp.T = static_cast<int>(bx.shape(0));
@@ -116,6 +129,15 @@ nb::tuple lp_solve(Maybe E, Array A, Array C, Maybe G, Array bx, Array by, Mask 
     lp.floor = floor.data();
     lp.cap = cap.data();
     lp.slack = data_of(slack);
+    return lp;
+}
+
+nb::tuple lp_solve(Maybe E, Array A, Array C, Maybe G, Array bx, Array by, Mask seen, Maybe lo, Maybe hi, Maybe x0_lo,
+                   Maybe x0_hi, Maybe theta_lo, Maybe theta_hi, Index group, Array h, Array c, Array floor, Array cap,
+                   Maybe slack, int point, double tol, double central_gap, int max_iter, bool multipliers) {
+    const hw::LpProblem lp = problem({E, A, C, G, bx, by, seen, lo, hi, x0_lo, x0_hi, theta_lo, theta_hi, group, h, c,
+                                      floor, cap, slack});
+    const std::size_t T = lp.T, n = lp.n, rows = lp.n + lp.m;
     hw::LpSettings set;
     set.point = point;
     set.tol = tol;
@@ -144,6 +166,46 @@ nb::tuple lp_solve(Maybe E, Array A, Array C, Maybe G, Array bx, Array by, Mask 
     return nb::make_tuple(x, theta, s, lam, e, info);
 }
 
+nb::tuple lp_windows(Maybe E, Array A, Array C, Array bx, Array by, Mask seen, Maybe lo, Maybe hi, Maybe x0_lo,
+                     Maybe x0_hi, Index group, Array h, Array c, Array floor, Array cap, Index start, int memory,
+                     double carry, int point, double tol, double central_gap, int max_iter) {
+    hw::LpWindows win{};
+    win.whole = problem({E, A, C, std::nullopt, bx, by, seen, lo, hi, x0_lo, x0_hi, std::nullopt, std::nullopt, group, h,
+                         c, floor, cap, std::nullopt});
+    const std::size_t T = win.whole.T, n = win.whole.n, ns = win.whole.ns;
+    need(start.shape(0) == T, "start (T) expected");
+    int longest = 0;
+    for (int t = 0; t < win.whole.T; t++) {
+        need(start.data()[t] >= 0 && start.data()[t] <= t, "0 <= start[t] <= t expected");
+        longest = std::max(longest, t - start.data()[t]);
+    }
+    win.start = start.data();
+    win.memory = memory;
+    win.carry = carry;
+    hw::LpSettings set;
+    set.point = point;
+    set.tol = tol;
+    set.central_gap = central_gap;
+    set.max_iter = max_iter;
+    nb::object filtered = fresh({T, n}, &win.filtered), smoothed = fresh({T + 1, n}, &win.smoothed);
+    nb::object s = fresh({T, ns}, &win.s), low = fresh({T + 1, n}, &win.low), high = fresh({T + 1, n}, &win.high);
+    nb::object seconds = fresh({T}, &win.seconds);
+    int* codes = new int[2 * T]();
+    nb::capsule owner(codes, [](void* q) noexcept { delete[] static_cast<int*>(q); });
+    nb::object both = nb::cast(nb::ndarray<nb::numpy, int>(codes, {std::size_t(2), T}, owner));
+    win.status = codes;
+    win.iterations = codes + T;
+    std::unique_ptr<double[]> extra(new double[(longest + 4) * n]);
+    win.scratch = extra.get();
+    {
+        nb::gil_scoped_release release;
+        void* work = scratch.get(HW_PICK(lp_windows_workspace)(win, set));
+        HW_PICK(lp_windows)(win, set, work);
+        scratch.trim();
+    }
+    return nb::make_tuple(filtered, smoothed, s, low, high, both, seconds);
+}
+
 }  // namespace
 
 void bind_lp(nb::module_& mod) {
@@ -152,4 +214,9 @@ void bind_lp(nb::module_& mod) {
             "c"_a, "floor"_a, "cap"_a, "slack"_a.none(), "point"_a = 1, "tol"_a = 1e-9, "central_gap"_a = 0.3,
             "max_iter"_a = 100, "multipliers"_a = false,
             "Solve the linear program of bounded noise: (x, theta, s, multipliers, slack, info); see core/lp_types.hpp.");
+    mod.def("lp_windows", &lp_windows, "E"_a.none(), "A"_a, "C"_a, "bx"_a, "by"_a, "seen"_a, "lo"_a.none(), "hi"_a.none(),
+            "x0_lo"_a.none(), "x0_hi"_a.none(), "group"_a, "h"_a, "c"_a, "floor"_a, "cap"_a, "start"_a, "memory"_a,
+            "carry"_a = 0.0, "point"_a = 1, "tol"_a = 1e-9, "central_gap"_a = 0.3, "max_iter"_a = 100,
+            "Solve the window start[t]..t for every row t: (filtered, smoothed, s, low, high, (status, iterations),"
+            " seconds); see core/lp_types.hpp.");
 }

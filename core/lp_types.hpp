@@ -53,4 +53,20 @@ struct LpOut {
     LpInfo info;
 };
 
+// A window sliding over one record: at row t the problem of rows start[t]..t is solved.
+struct LpWindows {
+    LpProblem whole;     // of the whole record; x0_lo, x0_hi bound the state before its first row
+    const int* start;    // (T) first row of each window
+    int memory;          // a state's interval is that of its estimates from the next `memory` windows
+    double carry;        // kappa with which a finished interval bounds the state a window starts from; 0: not
+    double* filtered;    // (T, n)  newest state of each window
+    double* smoothed;    // (T+1, n)  last estimate of each state
+    double* s;           // (T, ns)
+    double *low, *high;  // (T+1, n)  least and largest estimate of each state by the windows that end within `memory`
+    int* status;         // (T)
+    int* iterations;     // (T)
+    double* seconds;     // (T)
+    double* scratch;     // (longest window + 1) n + 2 n
+};
+
 }  // namespace hw

@@ -10,8 +10,10 @@ ESTIMATORS: dict[str, str] = {
     "ExtendedKalman": "nonlinear",
     "UnscentedKalman": "nonlinear",
     "ParticleFilter": "particle",
+    "BatchLP": "map",
+    "SequentialLP": "sequential",
+    "Window": "window",
 }
-ESTIMATORS: dict[str, str] = {"BatchLP": "map"}
 
 
 def load(name: str) -> Any:
