@@ -24,7 +24,7 @@ def main():
         names={"x": ["east", "north", "azimuth"], "y": ["east", "north"], "u": ["speed", "yaw_rate"]},
     )
     u = np.c_[8 + 2 * np.sin(np.arange(300) / 40), 0.2 * np.cos(np.arange(300) / 25)]
-    truth, drive = hw.simulate(car, u, seed=2)
+    truth, drive = hw.simulate(car, u, seed=7)
     drive = drive.without(25.0, 40.0)
     methods = [hw.ExtendedKalman(smooth=True), hw.UnscentedKalman(smooth=True)]
     found = [hw.estimate(car, drive, method) for method in methods]

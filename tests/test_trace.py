@@ -72,7 +72,9 @@ FUNCTIONS = {
     "loop": lambda x: sum(a * b for a, b in zip(x, x[::-1], strict=True)),
     "reshape": lambda x: x.reshape(3, 1).T[0] + x[::-1] + np.roll(x, 1) + np.flip(x),
     "real": lambda x: np.real(x) + x.real,
-    "divided": lambda x: 1.0 / (2 + x**2) + x / 3 + np.true_divide(x, 2 + x**2) + np.float64(2.0) * x[0] - np.float64(1.0),
+    "divided": lambda x: (
+        1.0 / (2 + x**2) + x / 3 + np.true_divide(x, 2 + x**2) + np.float64(2.0) * x[0] - np.float64(1.0)
+    ),
 }
 
 
@@ -199,10 +201,26 @@ def test_constants_are_folded():
 @given(st.data())
 def test_random_expressions(data):
     """Random expressions of all operations agree with NumPy wherever both are finite."""
-    unary = ["sin", "cos", "tanh", "exp", "arctan", "abs", "square", "sqrt", "cbrt", "log1p", "floor", "sign", "arcsinh"]
+    unary = [
+        "sin",
+        "cos",
+        "tanh",
+        "exp",
+        "arctan",
+        "abs",
+        "square",
+        "sqrt",
+        "cbrt",
+        "log1p",
+        "floor",
+        "sign",
+        "arcsinh",
+    ]
     binary = ["add", "subtract", "multiply", "divide", "maximum", "minimum", "arctan2", "hypot", "remainder", "power"]
     program = data.draw(
-        st.lists(st.tuples(st.sampled_from(unary + binary), st.integers(0, 99), st.integers(0, 99)), min_size=1, max_size=12)
+        st.lists(
+            st.tuples(st.sampled_from(unary + binary), st.integers(0, 99), st.integers(0, 99)), min_size=1, max_size=12
+        )
     )
 
     def f(x):
@@ -226,7 +244,9 @@ def test_random_expressions(data):
         tame = np.isfinite(expected) & (np.abs(expected) < 1e6)
         tame = np.logical_and.accumulate(tame, axis=1)
         close = np.isclose(got, expected, rtol=1e-9, atol=1e-9)
-        jumps = any(name in ("floor", "sign", "remainder", "arctan2", "power", "divide", "sqrt", "cbrt") for name, *_ in program)
+        jumps = any(
+            name in ("floor", "sign", "remainder", "arctan2", "power", "divide", "sqrt", "cbrt") for name, *_ in program
+        )
         assert close[tame].all() or jumps
         assert not np.isnan(got[np.isfinite(expected)]).any() or jumps
 

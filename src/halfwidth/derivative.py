@@ -14,7 +14,9 @@ from halfwidth.array import Array
 _STEP = float(np.finfo(np.float64).eps) ** 0.2
 
 
-def differences(f: Callable[[Array], Array], x: Array, scale: Array | None = None, angles: tuple[int, ...] = ()) -> Array:
+def differences(
+    f: Callable[[Array], Array], x: Array, scale: Array | None = None, angles: tuple[int, ...] = ()
+) -> Array:
     """Return the Jacobian (m, n) of `f` at `x`.
 
     Parameters

@@ -168,7 +168,9 @@ def compiled(f: Callable[..., Any], sizes: Sequence[int | None], points: Iterabl
     """
     tape = trace(f, sizes)
     if not tape.agrees(f, points):
-        raise Untraceable("what was recorded gives other values than the function itself; is it random, or does it count?")
+        raise Untraceable(
+            "what was recorded gives other values than the function itself; is it random, or does it count?"
+        )
     return tape
 
 
@@ -194,8 +196,24 @@ _NAMES = {
     "true_divide": "divide", "mod": "remainder", "fmax": "maximum", "fmin": "minimum",
 }  # fmt: skip
 _TWO = frozenset(
-    "add subtract multiply divide power arctan2 hypot maximum minimum remainder fmod floor_divide "
-    "less less_equal equal not_equal".split()
+    [
+        "add",
+        "subtract",
+        "multiply",
+        "divide",
+        "power",
+        "arctan2",
+        "hypot",
+        "maximum",
+        "minimum",
+        "remainder",
+        "fmod",
+        "floor_divide",
+        "less",
+        "less_equal",
+        "equal",
+        "not_equal",
+    ]
 )
 _COMMUTING = frozenset({"add", "multiply", "hypot", "equal", "not_equal"})
 _SPLIT: dict[str, Callable[..., Any]] = {
@@ -267,9 +285,7 @@ class _Recorder:
             arguments = tuple(sorted(arguments))
         return self.step(name, *arguments)
 
-    def _simpler(
-        self, name: str, arguments: tuple[int, ...], numbers: list[float | None]
-    ) -> "_Variable | None":
+    def _simpler(self, name: str, arguments: tuple[int, ...], numbers: list[float | None]) -> "_Variable | None":
         """Neutral and zero factors, and small powers: what products with sparse matrices leave behind."""
 
         def here(slot: int) -> _Variable:
@@ -438,13 +454,13 @@ class _Array(np.ndarray):  # type: ignore[type-arg]
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         return _ufunc(ufunc, method, inputs, kwargs)
 
-    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:  # noqa: ARG002
+    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         return _function(func, args, kwargs)
 
-    def max(self, axis: Any = None, **kwargs: Any) -> Any:  # noqa: A003
+    def max(self, axis: Any = None, **kwargs: Any) -> Any:
         return _ufunc(np.maximum, "reduce", (self,), {"axis": axis, **kwargs})
 
-    def min(self, axis: Any = None, **kwargs: Any) -> Any:  # noqa: A003
+    def min(self, axis: Any = None, **kwargs: Any) -> Any:
         return _ufunc(np.minimum, "reduce", (self,), {"axis": axis, **kwargs})
 
     def clip(self, a_min: Any = None, a_max: Any = None, **kwargs: Any) -> Any:
@@ -465,7 +481,7 @@ class _Variable:
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         return _ufunc(ufunc, method, inputs, kwargs)
 
-    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:  # noqa: ARG002
+    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         return _function(func, args, kwargs)
 
     def __repr__(self) -> str:
@@ -530,7 +546,7 @@ class _Variable:
         return self
 
     @property
-    def T(self) -> "_Variable":  # noqa: N802
+    def T(self) -> "_Variable":
         return self
 
 
@@ -576,10 +592,38 @@ for _symbol, _name in {"neg": "negative", "abs": "absolute", "pos": "positive", 
                        "trunc": "trunc"}.items():  # fmt: skip
     setattr(_Variable, f"__{_symbol}__", _unary(_name))
 # NumPy's object loops call methods of the entries by the name of the function.
-for _name in (
-    "sqrt cbrt square reciprocal sign exp exp2 expm1 log log2 log10 log1p sin cos tan arcsin arccos arctan sinh cosh "
-    "tanh arcsinh arccosh arctanh rint deg2rad rad2deg radians degrees conjugate"
-).split():
+for _name in [
+    "sqrt",
+    "cbrt",
+    "square",
+    "reciprocal",
+    "sign",
+    "exp",
+    "exp2",
+    "expm1",
+    "log",
+    "log2",
+    "log10",
+    "log1p",
+    "sin",
+    "cos",
+    "tan",
+    "arcsin",
+    "arccos",
+    "arctan",
+    "sinh",
+    "cosh",
+    "tanh",
+    "arcsinh",
+    "arccosh",
+    "arctanh",
+    "rint",
+    "deg2rad",
+    "rad2deg",
+    "radians",
+    "degrees",
+    "conjugate",
+]:
     setattr(_Variable, _name, _unary(_name))
 for _name in ("arctan2", "hypot", "fmod"):
     setattr(_Variable, _name, _operator(_name))

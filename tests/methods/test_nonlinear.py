@@ -89,7 +89,12 @@ def test_on_linear_functions_it_is_the_kalman_filter(method):
 def test_on_linear_models_it_is_the_kalman_filter(smooth):
     rng = np.random.default_rng(1)
     model = hw.Linear(
-        lambda dt: [[1.0, dt], [0.0, 1.0]], None, [[1.0, 0.0]], hw.Gaussian(0.1), hw.Gaussian(1.0), hw.Normal([0.0, 0.0], 1.0)
+        lambda dt: [[1.0, dt], [0.0, 1.0]],
+        None,
+        [[1.0, 0.0]],
+        hw.Gaussian(0.1),
+        hw.Gaussian(1.0),
+        hw.Normal([0.0, 0.0], 1.0),
     )
     record = hw.Record(np.cumsum(rng.uniform(0.5, 1.5, 30)), rng.normal(size=30))
     kalman = hw.KalmanSmoother() if smooth else hw.KalmanFilter()
@@ -178,7 +183,9 @@ def test_filterpy_agrees():
     _, record = hw.simulate(model, np.sin(np.arange(60) / 20)[:, None], seed=2)
     for settings in ({"alpha": 1.0, "beta": 2.0, "kappa": 0.0}, {"alpha": 0.1, "beta": 2.0, "kappa": -1.0}):
         points = kalman.MerweScaledSigmaPoints(5, **settings)
-        peer = kalman.UnscentedKalmanFilter(5, 2, 0.2, fx=lambda x, dt, u: ctrv_step(x, u, dt), hx=lambda x: x[:2], points=points)
+        peer = kalman.UnscentedKalmanFilter(
+            5, 2, 0.2, fx=lambda x, dt, u: ctrv_step(x, u, dt), hx=lambda x: x[:2], points=points
+        )
         peer.x, peer.P = model.x0.mean.copy(), model.x0.P.copy()
         peer.Q, peer.R = model.w.cov().single, model.e.cov().single
         x, P, loglik = [], [], 0.0
@@ -197,12 +204,18 @@ def test_filterpy_agrees():
 def square_root_sensor(**more):
     """A range seen from close by: one linearisation is not enough."""
     return hw.Nonlinear(
-        lambda x: x, lambda x: np.hypot(x[0], x[1]), hw.Gaussian(1e-6), hw.Gaussian(1e-4), hw.Normal([1.0, 0.5], [0.5, 0.05]), **more
+        lambda x: x,
+        lambda x: np.hypot(x[0], x[1]),
+        hw.Gaussian(1e-6),
+        hw.Gaussian(1e-4),
+        hw.Normal([1.0, 0.5], [0.5, 0.05]),
+        **more,
     )
 
 
 def log_posterior(model, record, x0, x):
     """Of a trajectory, up to a constant."""
+
     def half(v, S):
         return -0.5 * float(v @ np.linalg.solve(S, v))
 
@@ -253,6 +266,7 @@ def test_why_it_ran_in_python_is_told():
 
 def test_a_branch_met_only_on_the_way_is_found_out():
     """Recorded where it is one thing, it would be wrong where it is another: the answer is checked too."""
+
     def g(x):
         try:
             return x + 1.0 if x[0] < 5 else x + 2.0
@@ -275,7 +289,9 @@ def test_jacobians_of_the_user():
         return np.array([[np.cos(x[0])]])
 
     def model(**jacobians):
-        return hw.Nonlinear(np.sin, lambda x: x**2, hw.Gaussian(0.1), hw.Gaussian(0.1), hw.Normal([0.5], 1.0), **jacobians)
+        return hw.Nonlinear(
+            np.sin, lambda x: x**2, hw.Gaussian(0.1), hw.Gaussian(0.1), hw.Normal([0.5], 1.0), **jacobians
+        )
 
     record = hw.Record(np.arange(4.0), [0.4, 0.3, None, 0.1])
     plain = hw.estimate(model(), record, ExtendedKalman())
@@ -331,9 +347,11 @@ def hard(model, record):
     yield "nothing seen", model, hw.Record(record.t, np.full_like(record.y, np.nan), record.u)
     yield "one row", model, hw.Record(record.t[:1], record.y[:1], record.u[:1])
     yield "no noise at all", dataclasses.replace(model, w=hw.Gaussian(0.0), e=hw.Gaussian(0.0)), record
-    yield "no noise, certain start", dataclasses.replace(
-        model, w=hw.Gaussian(0.0), e=hw.Gaussian(0.0), x0=hw.Normal(model.x0.mean, 0.0)
-    ), record
+    yield (
+        "no noise, certain start",
+        dataclasses.replace(model, w=hw.Gaussian(0.0), e=hw.Gaussian(0.0), x0=hw.Normal(model.x0.mean, 0.0)),
+        record,
+    )
     yield "certain outputs", dataclasses.replace(model, e=hw.Gaussian(0.0)), record
     yield "vague prior", dataclasses.replace(model, x0=hw.Normal(model.x0.mean, 1e12)), record
     yield "far away", model, hw.Record(record.t, record.y + 1e9, record.u)
@@ -474,7 +492,9 @@ def test_a_wrong_g_is_named_when_the_model_is_made(g, error, words):
 )
 @pytest.mark.parametrize("method", IN_PYTHON[:2], ids=repr)
 def test_a_g_that_turns_wrong_later_is_named_with_its_time(value, error, words, method):
-    model = hw.Nonlinear(changes(value, 40), lambda x: x, hw.Gaussian(1.0), hw.Gaussian(1.0), hw.Normal([0.0, 0.0], 1.0))
+    model = hw.Nonlinear(
+        changes(value, 40), lambda x: x, hw.Gaussian(1.0), hw.Gaussian(1.0), hw.Normal([0.0, 0.0], 1.0)
+    )
     with pytest.raises(error, match=words) as caught:
         hw.estimate(model, hw.Record(np.arange(40.0), np.zeros((40, 2))), method)
     assert "t = " in str(caught.value)

@@ -171,12 +171,15 @@ class Reference:
         Scale of each unknown: how far it moves when its rows change by one sigma.
     redundancy : (p,) array
         How many rows' worth of each group's noise shows in the residuals, 0 to its number of rows.
+    traceless : (p,) bool array
+        Groups with rows whose noise the trajectory absorbs entirely, whatever the scales.
     """
 
     X: Array
     sigma: Array
     column: Array
     redundancy: Array
+    traceless: NDArray[np.bool_]
 
 
 def reference(rows: Residuals, model: Linear, known: Array) -> Reference:
@@ -198,7 +201,7 @@ def reference(rows: Residuals, model: Linear, known: Array) -> Reference:
     count = rows.count
     sigma = np.where(known > 0, known, _first_scales(rows, model))
     X = np.zeros(rows.M.shape[1])
-    share = np.zeros(p)
+    share, best = np.zeros(p), np.zeros(p)
     for _ in range(_ROUNDS):
         solve, column = _least_squares(rows, sigma)
         scale = rows.S @ sigma
@@ -212,11 +215,12 @@ def reference(rows: Residuals, model: Linear, known: Array) -> Reference:
             noise = np.where(mine, signs, 0.0)
             left = noise - (rows.M @ solve(noise)) / scale
             share[j] = np.clip(signs[mine] @ left[mine] / count[j], 0.0, 1.0)
-        level = np.sqrt(square / np.maximum(share * count, 1.0))
-        level = np.maximum(np.where(share > TRACE, level, sigma), 1e-12 * size)
+        # The scale so far counts as one more residual, so that few or exact residuals do not make it collapse.
+        level = np.maximum(np.sqrt((square + sigma**2) / (share * count + 1.0)), 1e-12 * size)
         sigma = np.where((count > 0) & (known == 0), level, sigma)
         sigma = np.where(sigma > 0, sigma, 1.0)
-    return Reference(X, sigma, column, share * count)
+        best = np.maximum(best, share)
+    return Reference(X, sigma, column, share * count, (count > 0) & (best <= TRACE))
 
 
 def _first_scales(rows: Residuals, model: Linear) -> Array:

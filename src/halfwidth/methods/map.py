@@ -36,7 +36,6 @@ from halfwidth.array import Array
 from halfwidth.errors import BadValue
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._residuals import (
-    TRACE,
     Reference,
     Residuals,
     reference,
@@ -47,7 +46,7 @@ from halfwidth.model import Linear, Model
 from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.solvers.lp import HIGHS, PIQP, Program, Solution, Solver, Verdict, solve
+from halfwidth.solvers.lp import HIGHS, PIQP, Program, Solution, Solver, Verdict, highs, solve
 from halfwidth.spread import Box
 
 _SOLVERS: dict[str, tuple[Solver, ...]] = {
@@ -55,13 +54,20 @@ _SOLVERS: dict[str, tuple[Solver, ...]] = {
     "piqp": (PIQP,),
     "highs": (HIGHS,),
 }
+# HiGHS can be slow on quadratic programs; without that stage the estimate is still optimal.
+_QUADRATIC: dict[str, tuple[Solver, ...]] = {
+    "auto": (PIQP, highs(time_limit=2.0)),
+    "piqp": (PIQP,),
+    "highs": (highs(time_limit=60.0),),
+}
 _STATUS = {
     Verdict.OPTIMAL: Status.OK,
     Verdict.REDUCED: Status.REDUCED,
     Verdict.INFEASIBLE: Status.INFEASIBLE,
 }
-#: Share of sigma, or of itself if larger, by which an optimal half-width is widened for the least-squares stage.
-_RELAX = 1e-6
+#: Share of sigma, or of itself if larger, by which an optimal half-width is widened for the least-squares stage; the
+#: second where the first leaves too little room.
+_RELAX = (1e-6, 1e-4)
 #: Residuals, half-widths and excesses below this share of sigma count as 0.
 _ZERO = 1e-5
 #: Steps of majorise-minimise for the logarithmic objective.
@@ -81,7 +87,7 @@ class BatchLP:
         half-width, since it has no minimum otherwise.
     point : {"least_squares", "optimal"}
         Which trajectory of the optimal face: that of least squares in units of sigma, inside the optimal half-widths
-        widened by 1e-6 of sigma; or the one the solver happens to return.
+        widened by 1e-6 of sigma (1e-4 where that leaves too little room); or the one the solver happens to return.
     grow_caps : bool
         Where the caps ``at_most`` of unknown half-widths leave no trajectory, double them until one fits (step 7 of
         the paper's algorithm); ``info["caps_grown"]`` says how often.
@@ -199,11 +205,13 @@ class BatchLP:
             return self._estimate(model, record, task.clipped(base.X), None, Status.STALLED, info)
 
         X, s = task.point(found.x), task.half_widths(found.x)
-        if self.point == "least_squares":
-            second = solve(task.squares(found.x), solvers)
-            if second.solved and second.x is not None:
-                X = task.clipped(base.X + base.column * second.x)
-                status = _STATUS[second.verdict] if status is Status.OK else status
+        if self.point == "least_squares" and np.any(found.x[base.X.size :] > _RELAX[0]):
+            for relax in _RELAX:
+                second = solve(task.squares(found.x, relax), _QUADRATIC[self.solver])
+                if second.solved and second.x is not None:
+                    X = task.point(second.x)
+                    status = _STATUS[second.verdict] if status is Status.OK else status
+                    break
             else:
                 status = Status.REDUCED
                 info["message"] = "the least-squares stage failed, so this is the solver's own optimal trajectory"
@@ -329,6 +337,8 @@ class _Task:
         Half-widths to be found.
     x_lo, x_hi : (n,) arrays
         Box of X in its own units.
+    floor, cap : (p,) arrays
+        Ends of the half-widths in their own units.
     """
 
     rows: Residuals
@@ -343,6 +353,8 @@ class _Task:
     free: NDArray[np.bool_]
     x_lo: Array
     x_hi: Array
+    floor: Array
+    cap: Array
 
     @classmethod
     def build(cls, rows: Residuals, base: Reference, model: Linear) -> "_Task":
@@ -374,6 +386,8 @@ class _Task:
             free,
             x_lo,
             x_hi,
+            floor,
+            cap,
         )
 
     def weights(self, objective: str) -> Array:
@@ -387,7 +401,8 @@ class _Task:
 
     def grown(self, factor: float) -> "_Task":
         """Return the task with the caps of unknown half-widths multiplied."""
-        return replace(self, highest=np.where(self.free, factor * self.highest, self.highest))
+        more = np.where(self.free, factor, 1.0)
+        return replace(self, highest=more * self.highest, cap=more * self.cap)
 
     def program(self, weight: Array) -> Program:
         """Return the linear program over (xi, s^)."""
@@ -418,18 +433,22 @@ class _Task:
             floor=1e-3,
         )
 
-    def squares(self, v: Array) -> Program:
+    def squares(self, v: Array, relax: float) -> Program:
         """Return the quadratic program of least squares inside the optimal half-widths, a little widened."""
         import scipy.sparse as sp
 
-        s = v[self.M.shape[1] :]
-        wide = np.minimum(s + _RELAX * np.maximum(s, 1.0), np.maximum(self.highest, s))
+        n = self.M.shape[1]
+        s = v[n:]
+        wide = np.minimum(s + relax * np.maximum(s, 1.0), np.maximum(self.highest, s))
         limit = self.S @ np.where(self.free, wide, self.lowest)
+        # Groups without noise stay where they are: a sliver of room would only make the program ill-conditioned.
+        none = np.asarray(self.S @ (self.free & (s > relax) | (~self.free & (self.lowest > 0))).astype(float)) == 0
+        still = np.asarray(self.M @ v[:n])
         return Program(
             c=np.asarray(self.M.T @ self.rho),
             G=self.M,
-            row_lo=-limit - self.rho,
-            row_hi=limit - self.rho,
+            row_lo=np.where(none, still, -limit - self.rho),
+            row_hi=np.where(none, still, limit - self.rho),
             lo=self.lo,
             hi=self.hi,
             P=sp.csr_array(self.M.T @ self.M),
@@ -514,12 +533,11 @@ class _Task:
     def enough(self, X: Array, s: Array) -> Array:
         """Return half-widths that hold the residuals of X: the largest of each group, between floor and cap."""
         rho = np.abs(self.rows.at(X))
-        floor, cap = self.lowest * self.base.sigma, self.highest * self.base.sigma
         if self.S.nnz == self.rho.size:
             tight = self.rows.largest(rho)
         else:
             tight = s + self.rows.largest(np.maximum(rho - self.rows.S @ s, 0.0))
-        return np.where(self.free, np.clip(tight, floor, cap), floor)
+        return np.where(self.free, np.clip(tight, self.floor, self.cap), self.floor)
 
     def report(
         self, X: Array, s: Array, model: Linear, record: Record, value: float, found: Solution
@@ -534,13 +552,12 @@ class _Task:
         k = T * nx + np.flatnonzero(np.diff(rows.S.indptr)[T * nx :] == 1)
         e[rows.row[k], rows.group[k] - nx] = -rho[k]
         names = [f"q[{n}]" for n in model.names.x] + [f"r[{n}]" for n in model.names.y]
-        share = np.where(rows.count > 0, base.redundancy / np.maximum(rows.count, 1.0), 0.0)
         blind = unseen_directions(rows, model, record)
-        lost = self.free & (share <= TRACE)
+        lost = self.free & base.traceless
         unseen = _unknown(model) & (rows.count == 0)
         zero = self.free & ~lost & (s <= _ZERO * base.sigma) & (self.lowest == 0)
-        low = self.free & ~lost & (self.lowest > 0) & (s <= self.lowest * base.sigma * (1 + 1e-6))
-        high = self.free & (s >= self.highest * base.sigma * (1 - 1e-6))
+        low = self.free & ~lost & (self.floor > 0) & (s <= self.floor * (1 + 1e-6))
+        high = self.free & (s >= self.cap * (1 - 1e-6))
         notes = []
         for mask, what in (
             (lost | unseen, "bound not identifiable"),

@@ -81,7 +81,9 @@ class ParticleFilter:
         if isinstance(model.x0, Box) and not np.isfinite([model.x0.lo, model.x0.hi]).all():
             return "`ParticleFilter` cannot draw from a prior without ends\nhint: x0=Box(lo, hi) or Normal(mean, P)"
         if isinstance(model, Linear) and model.theta_entries:
-            return "`ParticleFilter` needs a known model but some entries are NaN\nhint: give every entry of A, B, C, E, F"
+            return (
+                "`ParticleFilter` needs a known model but some entries are NaN\nhint: give every entry of A, B, C, E, F"
+            )
         if model.loss is not None:
             return "`ParticleFilter` cannot tell losses from outputs\nhint: RBPF(), or a model without `loss`"
         if self.smooth and not _has_density(model.w):
