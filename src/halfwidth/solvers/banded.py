@@ -270,22 +270,52 @@ def _proved(chain: Chain, answer: Answer) -> Answer:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Shifted:
+    """A chain, and where the variables of a program stand to its own: ``X = ref + column xi``, ``s = sigma s^``.
+
+    Parameters
+    ----------
+    chain : Chain
+    ref, column : ((T + 1) nx,) arrays
+    sigma : (ns,) array
+    known : (K,) bool array
+        Rows of known half-width; the program holds them two-sided behind the others.
+    """
+
+    chain: Chain
+    ref: Array
+    column: Array
+    sigma: Array
+    known: NDArray[np.bool_]
+
+
 def _claim(program: Program) -> Claim | None:
-    """Adapter for `halfwidth.solvers.lp`: None unless the program carries a chain that matches its rows."""
-    chain = program.chain
-    if not isinstance(chain, Chain) or program.P is not None or chain.slack is not None:
+    """Adapter for `halfwidth.solvers.lp`: None unless the program carries the chain it was built from."""
+    given = program.chain
+    if program.P is not None or not isinstance(given, Chain | Shifted):
         return None
+    chain = given.chain if isinstance(given, Shifted) else given
+    if chain.slack is not None:
+        return None
+    if isinstance(given, Shifted):
+        chain = replace(chain, c=program.c[len(given.ref) :] / given.sigma)
     found = solve(chain, point="optimal", multipliers=True, fallback=False)
     if found.status not in (Status.OK, Status.REDUCED) or found.multipliers is None:
         return None
-    T, nx = chain.bx.shape
+    nx = chain.bx.shape[1]
     lam = np.concatenate([found.multipliers[:, :nx].reshape(-1, 2), found.multipliers[:, nx:][chain.seen]])
-    return Claim(
-        Verdict.OPTIMAL,
-        np.r_[found.x.ravel(), found.theta, found.s],
-        np.r_[-lam[:, 0], lam[:, 1]],
-        iterations=found.iterations,
-    )
+    upper, lower = -lam[:, 0], lam[:, 1]
+    x, s = found.x.ravel(), found.s
+    if isinstance(given, Shifted):
+        x, s = (x - given.ref) / given.column, s / given.sigma
+        kind = np.r_[np.tile(np.arange(nx), chain.T), nx + np.nonzero(chain.seen)[1]]
+        size = given.sigma[kind]
+        upper, lower, open_ = upper * size, lower * size, ~given.known
+        z = np.r_[lower[open_], upper[open_], (upper + lower)[given.known]]
+    else:
+        z = np.r_[upper, lower]
+    return Claim(Verdict.OPTIMAL, np.r_[x, found.theta, s], z, iterations=found.iterations)
 
 
 #: The structured solver behind the checked interface; it takes programs made by `Chain.program`.

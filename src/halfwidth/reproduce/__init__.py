@@ -1,0 +1,60 @@
+"""The source papers' tables beside ours: `tables(number)` returns them as plain values, `text` prints them.
+
+Every paper is one module with ``tables(*, quick=False) -> tuple[Table, ...]`` and ``figures(folder)``. Reference numbers
+are those printed in the papers; notes say what cannot match and why.
+"""
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+from halfwidth.errors import BadValue
+
+#: Papers that are reproduced here, by number.
+PAPERS: dict[str, str] = {"000": "paper000", "003": "paper003"}
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table: titles, rows of cells, and what has to be said about it."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    notes: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """Return the table as aligned text."""
+        cells = [[_cell(c) for c in row] for row in (self.header, *self.rows)]
+        width = [max(len(row[k]) for row in cells) for k in range(len(self.header))]
+        lines = ["  ".join(c.rjust(w) if k else c.ljust(w) for k, (c, w) in enumerate(zip(row, width, strict=True)))
+                 for row in cells]  # fmt: skip
+        rule = "-" * len(lines[0])
+        return "\n".join([self.title, rule, lines[0], rule, *lines[1:], *[f"* {note}" for note in self.notes]])
+
+
+def paper(number: str) -> Any:
+    """Return the module of a paper.
+
+    Raises
+    ------
+    BadValue
+        If the paper is not reproduced here.
+    """
+    if number not in PAPERS:
+        raise BadValue(f"`{number}` is no paper that is reproduced here, one of {', '.join(PAPERS)} was expected")
+    return importlib.import_module(f"halfwidth.reproduce.{PAPERS[number]}")
+
+
+def tables(number: str, *, quick: bool = False) -> tuple[Table, ...]:
+    """Return the tables of a paper; `quick` runs a small part of each experiment."""
+    found: tuple[Table, ...] = paper(number).tables(quick=quick)
+    return found
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return str(value)
