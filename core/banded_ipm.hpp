@@ -1098,6 +1098,12 @@ struct BandedIpm {
         for (int c = 0; c < p; c++) zbest[c] = z[c];
     }
 
+    static bool finite_all(const double* a, I count) {
+        double s = 0.0;
+        for (I k = 0; k < count; k++) s += a[k] * 0.0;
+        return s == 0.0;
+    }
+
     // Back to the caller's units, and a last look at the rows themselves: lp_ok, or lp_stalled if they are broken.
     int finish(LpOut& out, const V* xs, const V* ls, const double* zs, bool grow) {
         for (int c = 0; c < p0; c++) out.theta[c] = sz[c] * (zref[c] + S * zs[c]);
@@ -1156,7 +1162,18 @@ struct BandedIpm {
             for (I t = 0; t < lp.T; t++)
                 for (int j = 0; j < rows; j++) obj += lp.slack[j] * out.slack[t * rows + j];
         out.info.objective = obj;
-        return worst <= 1e-7 && !capped_out && obj - obj == 0.0 ? lp_ok : lp_stalled;
+        bool broken = !(obj - obj == 0.0) || !finite_all(out.x, (I(lp.T) + 1) * n) || !finite_all(out.theta, p0) ||
+                      !finite_all(out.s, ns);
+        if (broken) {  // a failure is a status, never a NaN
+            for (I k = 0; k < (I(lp.T) + 1) * n; k++) out.x[k] = 0.0;
+            for (int c = 0; c < p0; c++) out.theta[c] = 0.0;
+            for (int c = 0; c < ns; c++) out.s[c] = 0.0;
+            for (I k = 0; out.lam && k < 2 * I(lp.T) * rows; k++) out.lam[k] = 0.0;
+            for (I k = 0; out.slack && k < I(lp.T) * rows; k++) out.slack[k] = 0.0;
+            out.info.objective = 0.0;
+            out.info.violation = 1.0;
+        }
+        return worst <= 1e-7 && !capped_out && !broken ? lp_ok : lp_stalled;
     }
 };
 
