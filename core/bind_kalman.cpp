@@ -86,7 +86,7 @@ hw::Stack shifted(hw::Stack s, std::int64_t t) {
     return s;
 }
 
-using Kernel = void (*)(hw::Kalman&);
+using Kernel = void (*)(hw::Kalman&, hw::Kalman*);
 
 nb::dict run(const std::string& mode, const Array& A, const std::optional<Array>& B, const Array& C, const Array& Q,
              const Array& R, const Array& y, const Mask& seen, const Array& x0, const Array& P0,
@@ -189,43 +189,52 @@ nb::dict run(const std::string& mode, const Array& A, const std::optional<Array>
     {
         nb::gil_scoped_release release;
         std::atomic<std::int64_t> next{0};
-        auto work = [&] {
-            std::vector<double> room(static_cast<std::size_t>(hw::kalman_work(nx, ny, k.lag)));
-            for (std::int64_t i; (i = next.fetch_add(1)) < N;) {
-                hw::Kalman s = k;
-                hw::KalmanSums sum;
-                const std::int64_t t = at[i];
-                s.T = at[i + 1] - t;
-                s.A = shifted(k.A, t); s.B = shifted(k.B, t); s.C = shifted(k.C, t);
-                s.Q = shifted(k.Q, t); s.R = shifted(k.R, t);
-                s.x0 = x0.data() + (x0_each ? i * nx : 0);
-                s.P0 = P0.data() + (P0_each ? i * nx * nx : 0);
-                auto move = [&](auto*& p, std::int64_t n) { if (p) p += t * n; };
-                move(s.u, nu); move(s.b, nx); move(s.d, ny); move(s.y, ny); move(s.seen, ny);
-                move(s.x, nx); move(s.P, nx * nx); move(s.xp, nx); move(s.Pp, nx * nx); move(s.yp, ny);
-                move(s.S, ny * ny); move(s.ll, 1); move(s.nis, 1); move(s.Pl, nx * nx);
-                if (s.x0s) { s.x0s += i * nx; s.P0s += i * nx * nx; }
-                if (sums) {
-                    double* p = parts.data() + i * each;
-                    double** to[11] = {&sum.W, &sum.nW, &sum.Wx, &sum.Wu, &sum.Xx, &sum.Xu, &sum.Uu, &sum.V, &sum.nV,
-                                       &sum.Vx, &sum.Xy};
-                    for (int j = 0; j < 11; j++) {
-                        *to[j] = p;
-                        p += size[j];
-                    }
-                    s.sums = &sum;
+        auto one = [&](std::int64_t i, hw::Kalman& s, hw::KalmanSums& sum, double* room) {
+            s = k;
+            const std::int64_t t = at[i];
+            s.T = at[i + 1] - t;
+            s.A = shifted(k.A, t); s.B = shifted(k.B, t); s.C = shifted(k.C, t);
+            s.Q = shifted(k.Q, t); s.R = shifted(k.R, t);
+            s.x0 = x0.data() + (x0_each ? i * nx : 0);
+            s.P0 = P0.data() + (P0_each ? i * nx * nx : 0);
+            auto move = [&](auto*& p, std::int64_t n) { if (p) p += t * n; };
+            move(s.u, nu); move(s.b, nx); move(s.d, ny); move(s.y, ny); move(s.seen, ny);
+            move(s.x, nx); move(s.P, nx * nx); move(s.xp, nx); move(s.Pp, nx * nx); move(s.yp, ny);
+            move(s.S, ny * ny); move(s.ll, 1); move(s.nis, 1); move(s.Pl, nx * nx);
+            if (s.x0s) { s.x0s += i * nx; s.P0s += i * nx * nx; }
+            if (sums) {
+                double* p = parts.data() + i * each;
+                double** to[11] = {&sum.W, &sum.nW, &sum.Wx, &sum.Wu, &sum.Xx, &sum.Xu, &sum.Uu, &sum.V, &sum.nV,
+                                   &sum.Vx, &sum.Xy};
+                for (int j = 0; j < 11; j++) {
+                    *to[j] = p;
+                    p += size[j];
                 }
-                s.work = room.data();
-                kernel(s);
-                loglik.a[i] = s.loglik;
-                code[i] = s.code;
-                row[i] = s.row;
-                n_seen[i] = s.n_seen;
-                n_reduced[i] = s.n_reduced;
+                s.sums = &sum;
+            }
+            s.work = room;
+        };
+        auto work = [&] {
+            const std::size_t each_room = static_cast<std::size_t>(hw::kalman_work(nx, ny, k.lag));
+            std::vector<double> room(2 * each_room);
+            hw::Kalman s[2];
+            hw::KalmanSums sum[2];
+            // two series in turns fill the machine better than one; a pair at a time is handed out
+            for (std::int64_t i; (i = 2 * next.fetch_add(1)) < N;) {
+                const int both = i + 1 < N ? 2 : 1;
+                for (int j = 0; j < both; j++) one(i + j, s[j], sum[j], room.data() + j * each_room);
+                kernel(s[0], both == 2 ? &s[1] : nullptr);
+                for (int j = 0; j < both; j++) {
+                    loglik.a[i + j] = s[j].loglik;
+                    code[i + j] = s[j].code;
+                    row[i + j] = s[j].row;
+                    n_seen[i + j] = s[j].n_seen;
+                    n_reduced[i + j] = s[j].n_reduced;
+                }
             }
         };
         const std::int64_t wanted = threads > 0 ? threads : static_cast<std::int64_t>(std::thread::hardware_concurrency());
-        const std::int64_t n_threads = wanted < N ? wanted : N;
+        const std::int64_t pairs = (N + 1) / 2, n_threads = wanted < pairs ? wanted : pairs;
         std::vector<std::thread> others;
         for (std::int64_t i = 1; i < n_threads; i++) others.emplace_back(work);
         work();

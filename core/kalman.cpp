@@ -71,24 +71,30 @@ void push(NX nx, NY ny, KalmanPush& k) {
 
 }  // namespace
 
-void kalman_filter(Kalman& k) {
-    FlushTiny scope;
-    with_sizes(k.nx, k.ny, [&](auto nx, auto ny) { filter(nx, ny, k, Arena{k.work}); });
-}
-
-void kalman_smooth(Kalman& k) {
+void kalman_filter(Kalman& k, Kalman* k2) {
     FlushTiny scope;
     with_sizes(k.nx, k.ny, [&](auto nx, auto ny) {
-        const std::int64_t good = filter(nx, ny, k, Arena{k.work});
-        smooth(nx, k, good, Arena{k.work});
+        std::int64_t good[2];
+        filter(nx, ny, k, k2, good);
     });
 }
 
-void kalman_lag(Kalman& k) {
+void kalman_smooth(Kalman& k, Kalman* k2) {
     FlushTiny scope;
     with_sizes(k.nx, k.ny, [&](auto nx, auto ny) {
-        const std::int64_t good = filter(nx, ny, k, Arena{k.work});
-        smooth_lag(nx, k, good, Arena{k.work});
+        std::int64_t good[2];
+        filter(nx, ny, k, k2, good);
+        smooth(nx, k, k2, good);
+    });
+}
+
+void kalman_lag(Kalman& k, Kalman* k2) {
+    FlushTiny scope;
+    with_sizes(k.nx, k.ny, [&](auto nx, auto ny) {
+        std::int64_t good[2];
+        filter(nx, ny, k, k2, good);
+        smooth_lag(nx, k, good[0], Arena{k.work});
+        if (k2) smooth_lag(nx, *k2, good[1], Arena{k2->work});
     });
 }
 

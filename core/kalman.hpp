@@ -92,7 +92,7 @@ struct Kalman {
 // Entries of workspace for these sizes (lag < 0: no lag).
 inline std::int64_t kalman_work(std::int64_t nx, std::int64_t ny, std::int64_t lag = -1) {
     const std::int64_t n = nx > 0 ? nx : 1, m = ny > 0 ? ny : 1;
-    return 16 * n * n + 12 * n + 10 * m * m + 8 * n * m + 8 * m + 64 + (lag > 0 ? lag * (2 * n * n + 2 * n) : 0);
+    return 16 * n * n + 16 * n + 10 * m * m + 8 * n * m + 12 * m + 64 + (lag > 0 ? lag * (2 * n * n + 2 * n) : 0);
 }
 
 namespace HW_ISA {
@@ -118,6 +118,25 @@ struct Room<0> {
 template <class M, class N = Dim<1>>
 constexpr int room = M::fixed && N::fixed ? M::cap * N::cap : 0;
 
+constexpr double rounding = 64.0 * eps;
+
+// Whether some variance fell to rounding noise of what it was: that state is now certain, up to what R (or Q) adds.
+template <class NX>
+inline bool determined(NX nx, const double* P, const double* was) {
+    bool any = false;
+    for (int i = 0; i < nx; i++) any = any || P[i * nx + i] < rounding * was[i];
+    return any;
+}
+
+// Of such states keep the part M that was not found by cancellation: P stays positive semidefinite.
+template <class NX>
+inline void clear(NX nx, const double* M, const double* was, double* P) {
+    for (int i = 0; i < nx; i++) {
+        if (!(P[i * nx + i] < rounding * was[i])) continue;
+        for (int j = 0; j < nx; j++) P[i * nx + j] = P[j * nx + i] = M[i * nx + j];
+    }
+}
+
 // The correction by one output. Holds C', reused while C stays the same matrix.
 template <class NX, class NY>
 struct Correction {
@@ -126,9 +145,10 @@ struct Correction {
     Room<room<NY, NX>> Ct_, CP_, Kt_, Cm_, Cmt_;
     Room<room<NY, NY>> S_, L_, Rm_, RK_;
     Room<room<NX, NX>> Zt_, PZ_;
-    Room<room<NY>> d_, di_, v_, z_;
+    Room<room<NY>> d_, di_, v_, z_, floor_;
+    Room<room<NX>> var_;
     Room<room<NY, NX>> RKt_;
-    double *Ct, *CP, *Kt, *Cm, *Cmt, *S, *L, *Rm, *Zt, *PZ, *d, *di, *v, *z, *RKt;
+    double *Ct, *CP, *Kt, *Cm, *Cmt, *S, *L, *Rm, *Zt, *PZ, *d, *di, *v, *z, *floor, *var, *RKt;
     const double* C_of_Ct = nullptr;
     LogProduct dets;
     double ll_quad = 0.0;  // sum of v' S^-1 v
@@ -140,7 +160,8 @@ struct Correction {
         RKt = RKt_.get(w, nm);
         S = S_.get(w, mm); L = L_.get(w, mm); Rm = Rm_.get(w, mm);
         Zt = Zt_.get(w, nn); PZ = PZ_.get(w, nn);
-        d = d_.get(w, m); di = di_.get(w, m); v = v_.get(w, m); z = z_.get(w, m);
+        d = d_.get(w, m); di = di_.get(w, m); v = v_.get(w, m); z = z_.get(w, m); floor = floor_.get(w, m);
+        var = var_.get(w, n);
     }
 
     // log-likelihood of all rows since the last call of `forget`
@@ -182,6 +203,15 @@ struct Correction {
         mul(ny, nx, nx, c, P, CP);
         for (int i = 0; i < ny; i++) copy(ny, r + i * ny, S + i * ny);
         mul<Op::add>(ny, nx, ny, CP, ct, S);
+        for (int i = 0; i < nx; i++) var[i] = P[i * nx + i];
+        for (int i = 0; i < ny; i++) {  // what is left of C P C' after cancellation may be rounding only
+            floor[i] = 0.0;
+            if (r[i * ny + i] < 0.5 * S[i * ny + i] || !(S[i * ny + i] > 0.0)) {
+                for (int j = 0; j < nx; j++) floor[i] += c[i * nx + j] * c[i * nx + j] * var[j];
+                floor[i] *= rounding * nx;
+                if (!(S[i * ny + i] > floor[i])) for (int j = 0; j < ny; j++) S[i * ny + j] = S[j * ny + i] = 0.0;
+            }
+        }
         const int vanished = ldl(ny, S, L, d, di);
 
         // A negative pivot is rounding of a belief already certain: left out as well. Overflow shows in x and P.
@@ -198,7 +228,7 @@ struct Correction {
                 if (ll) det += std::log(d[i]) + log_2pi;
             } else if (code == kalman_reduced) {
                 const double size = std::fabs(y[i]) + std::fabs(y[i] - v[i]) + std::sqrt(std::fabs(S[i * ny + i]));
-                if (std::fabs(s) > 1e-6 * size) code = kalman_contradicted;
+                if (std::fabs(s) > 1e-6 * size + 1e3 * std::sqrt(floor[i])) code = kalman_contradicted;
             }
         }
         if (quad > 1e12) code = kalman_contradicted;
@@ -223,6 +253,11 @@ struct Correction {
         mul_tn(nx, nx, nx, Zt, PZ, P);
         mul_tn<Op::add>(nx, ny, nx, Kt, RKt, P);
         symmetrise(nx, P);
+        if (determined(nx, P, var)) {
+            mul_tn(nx, ny, nx, Kt, RKt, PZ);
+            symmetrise(nx, PZ);
+            clear(nx, PZ, var, P);
+        }
         return code;
     }
 };
@@ -268,14 +303,15 @@ template <class NX>
 struct Retrodiction {
     NX nx;
     Room<room<NX, NX>> AP_, Pp_, L_, Gt_, Zt_, W_, T_;
-    Room<room<NX>> d_, di_, xp_, dx_;
-    double *AP, *Pp, *L, *Gt, *Zt, *W, *T, *d, *di, *xp, *dx;
+    Room<room<NX>> d_, di_, xp_, dx_, var_;
+    double *AP, *Pp, *L, *Gt, *Zt, *W, *T, *d, *di, *xp, *dx, *var;
 
     Retrodiction(NX n, Arena& w) : nx(n) {
         const int nn = n * n;
         AP = AP_.get(w, nn); Pp = Pp_.get(w, nn); L = L_.get(w, nn); Gt = Gt_.get(w, nn); Zt = Zt_.get(w, nn);
         W = W_.get(w, nn); T = T_.get(w, nn);
         d = d_.get(w, n); di = di_.get(w, n); xp = xp_.get(w, n); dx = dx_.get(w, n);
+        var = var_.get(w, n);
     }
     // Gt (nx,nx) = G', Zt = I - A' G'
     inline void gain(const double* A, const double* At, const double* P, const double* Q) {
@@ -293,12 +329,18 @@ struct Retrodiction {
     }
     // out = Z P Z' + G W G', after `gain`
     inline void covariance(const double* P, const double* W_, double* out) {
+        for (int i = 0; i < nx; i++) var[i] = P[i * nx + i];
         mul(nx, nx, nx, P, Zt, T);
         mul_tn(nx, nx, nx, Zt, T, AP);  // AP is free again; out may be P itself
         mul(nx, nx, nx, W_, Gt, T);
         mul_tn<Op::add>(nx, nx, nx, Gt, T, AP);
         for (int i = 0; i < nx; i++) copy(nx, AP + i * nx, out + i * nx);
         symmetrise(nx, out);
+        if (determined(nx, out, var)) {
+            mul_tn(nx, nx, nx, Gt, T, AP);
+            symmetrise(nx, AP);
+            clear(nx, AP, var, out);
+        }
     }
     // x <- x + G (xs - xp), in place
     inline void mean(const double* xs, double* x) {
@@ -321,20 +363,30 @@ inline bool sound(NX nx, const double* x, const double* P) {  // for a PSD matri
     return s == 0.0;
 }
 
-// The filter. Writes x, P and what else is asked; returns the number of rows with a sound belief (T unless broken).
+// The filter, row by row. Writes x, P and what else is asked.
 template <class NX, class NY>
-[[gnu::noinline]] std::int64_t filter(NX nx, NY ny, Kalman& k, Arena w) {
-    Correction<NX, NY> correct(nx, ny, w);
-    Prediction<NX> predict(nx, w);
+struct FilterPass {
+    NX nx;
+    NY ny;
+    Kalman& k;
+    Correction<NX, NY> correct;
+    Prediction<NX> predict;
     Room<room<NX>> x_;
     Room<room<NX, NX>> P_;
     Room<room<NY, NX>> CP_;
-    double *x = x_.get(w, nx), *P = P_.get(w, nx * nx), *CP = CP_.get(w, nx * ny);
-    const std::ptrdiff_t nn = nx * nx, mm = ny * ny;
-    copy(nx, k.x0, x);
-    for (int i = 0; i < nx; i++) copy(nx, k.P0 + i * nx, P + i * nx);
-    std::int64_t t = 0;
-    for (; t < k.T; t++) {
+    double *x, *P, *CP;
+    std::ptrdiff_t nn, mm;
+
+    FilterPass(NX n, NY m, Kalman& k_, Arena w) : nx(n), ny(m), k(k_), correct(n, m, w), predict(n, w), nn(n * n), mm(m * m) {
+        x = x_.get(w, n); P = P_.get(w, n * n); CP = CP_.get(w, n * m);
+        copy(nx, k.x0, x);
+        for (int i = 0; i < nx; i++) copy(nx, k.P0 + i * nx, P + i * nx);
+    }
+    FilterPass(const FilterPass&) = delete;
+
+    // False when the belief broke at this row. Not inlined: two series run row by row in turns, and while one waits for
+    // its own last row the machine works on the other; both must round alike, alone or in company.
+    [[gnu::noinline]] bool row(std::int64_t t) {
         const double *A = k.A.at(t), *C = k.C.at(t), *R = k.R.at(t);
         const double *off = k.d ? k.d + t * ny : nullptr, *y = k.y + t * ny;
         const std::uint8_t* seen = k.seen + t * ny;
@@ -360,32 +412,37 @@ template <class NX, class NY>
         }
         if (code == kalman_broken || !sound(nx, x, P)) {
             note(k, kalman_broken, t);
-            break;
+            return false;
         }
         copy(nx, x, k.x + t * nx);
         for (int i = 0; i < nx; i++) copy(nx, P + i * nx, k.P + t * nn + i * nx);
+        return true;
     }
-    k.loglik = correct.loglik();
-    k.n_seen = correct.n_used;
-    const std::int64_t good = t;
-    const double* x_last = good ? k.x + (good - 1) * nx : k.x0;
-    const double* P_last = good ? k.P + (good - 1) * nn : k.P0;
-    for (; t < k.T; t++) {  // broken: hold the last finite belief
-        for (int i = 0; i < nx; i++) k.x[t * nx + i] = x_last[i];
-        for (int i = 0; i < nn; i++) k.P[t * nn + i] = P_last[i];
-        if (k.xp) {
-            for (int i = 0; i < nx; i++) k.xp[t * nx + i] = x_last[i];
-            for (int i = 0; i < nn; i++) k.Pp[t * nn + i] = P_last[i];
+
+    // Ends the pass after `t` rows with a sound belief: the rows from there on hold the last one.
+    std::int64_t finish(std::int64_t t) {
+        k.loglik = correct.loglik();
+        k.n_seen = correct.n_used;
+        const std::int64_t good = t;
+        const double* x_last = good ? k.x + (good - 1) * nx : k.x0;
+        const double* P_last = good ? k.P + (good - 1) * nn : k.P0;
+        for (; t < k.T; t++) {  // broken: hold the last finite belief
+            for (int i = 0; i < nx; i++) k.x[t * nx + i] = x_last[i];
+            for (int i = 0; i < nn; i++) k.P[t * nn + i] = P_last[i];
+            if (k.xp) {
+                for (int i = 0; i < nx; i++) k.xp[t * nx + i] = x_last[i];
+                for (int i = 0; i < nn; i++) k.Pp[t * nn + i] = P_last[i];
+            }
+            if (k.yp) {
+                for (int i = 0; i < ny; i++) k.yp[t * ny + i] = 0.0;
+                for (int i = 0; i < mm; i++) k.S[t * mm + i] = 0.0;
+            }
+            if (k.ll) k.ll[t] = 0.0;
+            if (k.nis) k.nis[t] = 0.0;
         }
-        if (k.yp) {
-            for (int i = 0; i < ny; i++) k.yp[t * ny + i] = 0.0;
-            for (int i = 0; i < mm; i++) k.S[t * mm + i] = 0.0;
-        }
-        if (k.ll) k.ll[t] = 0.0;
-        if (k.nis) k.nis[t] = 0.0;
+        return good;
     }
-    return good;
-}
+};
 
 // Adds E[e e'] and its companions of row t; x, P are the smoothed belief.
 template <class NX>
@@ -499,27 +556,33 @@ struct StateSums {
     }
 };
 
-// The smoother, in place over the filtered rows 0..good-1.
+// The smoother, row by row back over the filtered rows 0..good-1, in place.
 template <class NX>
-[[gnu::noinline]] void smooth(NX nx, Kalman& k, std::int64_t good, Arena w) {
-    if (good == 0) {
-        if (k.x0s) {
-            copy(nx, k.x0, k.x0s);
-            for (int i = 0; i < nx; i++) copy(nx, k.P0 + i * nx, k.P0s + i * nx);
-        }
-        return;
-    }
-    Prediction<NX> predict(nx, w);
-    Retrodiction<NX> back(nx, w);
-    OutputSums<NX> output(nx, k.ny, w);
-    StateSums<NX> state(nx, w);
+struct SmootherPass {
+    NX nx;
+    Kalman& k;
+    Prediction<NX> predict;
+    Retrodiction<NX> back;
+    OutputSums<NX> output;
+    StateSums<NX> state;
     Room<room<NX>> x_;
     Room<room<NX, NX>> P_, S_;
-    double *x = x_.get(w, nx), *P = P_.get(w, nx * nx), *S = S_.get(w, nx * nx);
-    const std::ptrdiff_t nn = nx * nx;
-    if (k.sums) output.add(k, good - 1, k.x + (good - 1) * nx, k.P + (good - 1) * nn);
-    const bool before = k.x0s || k.sums || k.Pl;  // the step from row -1 is wanted
-    for (std::int64_t t = good - 1; t >= (before ? 0 : 1); t--) {
+    double *x, *P, *S;
+    std::ptrdiff_t nn;
+    std::int64_t last;  // down to this row: 0 if the step from row -1 is wanted, else 1
+
+    SmootherPass(NX n, Kalman& k_, std::int64_t good, Arena w)
+        : nx(n), k(k_), predict(n, w), back(n, w), output(n, k_.ny, w), state(n, w), nn(n * n) {
+        x = x_.get(w, n); P = P_.get(w, n * n); S = S_.get(w, n * n);
+        last = k.x0s || k.sums || k.Pl ? 0 : 1;
+        copy(nx, k.x0, x);
+        for (int i = 0; i < nx; i++) copy(nx, k.P0 + i * nx, P + i * nx);
+        if (k.sums && good > 0) output.add(k, good - 1, k.x + (good - 1) * nx, k.P + (good - 1) * nn);
+    }
+    SmootherPass(const SmootherPass&) = delete;
+
+    // The step from row t to row t - 1. Not inlined, as FilterPass::row.
+    [[gnu::noinline]] void row(std::int64_t t) {
         const double *xs = k.x + t * nx, *Ps = k.P + t * nn, *A = k.A.at(t), *Q = k.Q.at(t);
         const double* x1 = t ? k.x + (t - 1) * nx : k.x0;
         const double* P1 = t ? k.P + (t - 1) * nn : k.P0;
@@ -534,7 +597,6 @@ template <class NX>
         }
         double* xo = t ? k.x + (t - 1) * nx : x;
         double* Po = t ? k.P + (t - 1) * nn : P;
-        if (t == 0) copy(nx, k.x0, x);
         back.covariance(P1, back.W, Po);
         back.mean(xs, xo);
         if (k.Pl) mul(nx, nx, nx, Ps, back.Gt, k.Pl + t * nn);
@@ -543,11 +605,13 @@ template <class NX>
             if (t) output.add(k, t - 1, xo, Po);
         }
     }
-    if (k.x0s) {
+
+    void finish() {
+        if (!k.x0s) return;
         copy(nx, x, k.x0s);
         for (int i = 0; i < nx; i++) copy(nx, P + i * nx, k.P0s + i * nx);
     }
-}
+};
 
 // The last `lag` steps back, kept in a ring: of the step into row t, G', the covariance of x[t-1] given x[t], and the
 // means x[t-1] filtered and x[t] predicted.
@@ -581,6 +645,47 @@ struct LagRing {
         }
     }
 };
+
+// One series, or two in turns (`k2` may be null); `good` counts the rows with a sound belief of each.
+template <class NX, class NY>
+[[gnu::noinline]] void filter(NX nx, NY ny, Kalman& k, Kalman* k2, std::int64_t* good) {
+    FilterPass<NX, NY> a(nx, ny, k, Arena{k.work});
+    std::int64_t t = 0;
+    bool fine = true;
+    if (k2) {
+        FilterPass<NX, NY> b(nx, ny, *k2, Arena{k2->work});
+        std::int64_t t2 = 0;
+        bool fine2 = true;
+        while (t < k.T && t2 < k2->T && fine && fine2) {
+            fine = a.row(t);
+            fine2 = b.row(t2);
+            t += fine;
+            t2 += fine2;
+        }
+        while (fine2 && t2 < k2->T) t2 += fine2 = b.row(t2);
+        good[1] = b.finish(t2);
+    }
+    while (fine && t < k.T) t += fine = a.row(t);
+    good[0] = a.finish(t);
+}
+
+template <class NX>
+[[gnu::noinline]] void smooth(NX nx, Kalman& k, Kalman* k2, const std::int64_t* good) {
+    SmootherPass<NX> a(nx, k, good[0], Arena{k.work});
+    std::int64_t t = good[0] - 1;
+    if (k2) {
+        SmootherPass<NX> b(nx, *k2, good[1], Arena{k2->work});
+        std::int64_t t2 = good[1] - 1;
+        for (; t >= a.last && t2 >= b.last; t--, t2--) {
+            a.row(t);
+            b.row(t2);
+        }
+        for (; t2 >= b.last; t2--) b.row(t2);
+        b.finish();
+    }
+    for (; t >= a.last; t--) a.row(t);
+    a.finish();
+}
 
 // Fixed-lag smoother, in place over the filtered rows: row t becomes its belief given the rows up to min(t + lag, T - 1).
 template <class NX>
@@ -631,7 +736,8 @@ struct KalmanPush {
 
 }  // namespace hw
 
-HW_KERNEL(void, kalman_filter, ::hw::Kalman&)
-HW_KERNEL(void, kalman_smooth, ::hw::Kalman&)
-HW_KERNEL(void, kalman_lag, ::hw::Kalman&)
+// One series, or two of equal sizes in turns (the second may be null), each with its own workspace.
+HW_KERNEL(void, kalman_filter, ::hw::Kalman&, ::hw::Kalman*)
+HW_KERNEL(void, kalman_smooth, ::hw::Kalman&, ::hw::Kalman*)
+HW_KERNEL(void, kalman_lag, ::hw::Kalman&, ::hw::Kalman*)
 HW_KERNEL(void, kalman_push, ::hw::KalmanPush&)

@@ -7,9 +7,9 @@ import halfwidth as hw
 
 NAMES = """
 BadLog BadRecord BadShape BadValue BatchLP Box Cloud DataQualityWarning Estimate Estimator ExtendedKalman Gaussian
-HalfwidthError KalmanFilter KalmanSmoother Learned Linear Missing Mixed Nonlinear Normal ParticleFilter Record
-Recursive Refused Status Uniform UnscentedKalman Unsolved __version__ estimate forecast from_continuous learn resume
-score simulate stream
+HalfwidthError KalmanFilter KalmanSmoother Learned Linear LogTooBig Missing Mixed Nonlinear Normal ParticleFilter
+Record Recursive Refused Status Uniform UnscentedKalman Unsolved __version__ estimate forecast from_continuous learn
+resume score simulate stream
 """
 
 

@@ -32,6 +32,29 @@ def rotation(x):
     return np.array([[c, -s], [s, c]]) @ x[1:]
 
 
+def nested(x):
+    if x[0] > 0 and x[1] > 0:
+        return x**2 if x[2] < 0.3 else -x
+    if x[2] > 1 or x[0] < -1:
+        x = x + 1
+    return x * 2
+
+
+def turn(x):
+    """A car's step with the usual special case of driving straight on."""
+    v, a, w = x
+    if abs(w) < 0.2:
+        return np.array([v * np.cos(a), v * np.sin(a)])
+    return np.array([v / w * (np.sin(a + w) - np.sin(a)), v / w * (np.cos(a) - np.cos(a + w))])
+
+
+def newton(x):
+    root = 1.0 + x**2
+    for _ in range(4):
+        root = 0.5 * (root + (2 + x**2) / root)
+    return root
+
+
 FUNCTIONS = {
     "product": lambda x: A @ x + A.T @ x + x @ A + A.dot(x) + x.dot(A),
     "norm": lambda x: np.linalg.norm(x[:2]) + np.sqrt(x @ x),
@@ -72,6 +95,19 @@ FUNCTIONS = {
     "loop": lambda x: sum(a * b for a, b in zip(x, x[::-1], strict=True)),
     "reshape": lambda x: x.reshape(3, 1).T[0] + x[::-1] + np.roll(x, 1) + np.flip(x),
     "real": lambda x: np.real(x) + x.real,
+    "if": lambda x: x if x[0] > 0 else -x,
+    "branches": lambda x: nested(x),
+    "turn": lambda x: turn(x),
+    "max of two": lambda x: max(x[0], x[1]) + min(x),
+    "sorted": lambda x: np.sort(x) * [1, 2, 3] + sorted(x)[1],
+    "any": lambda x: x if any(x > 0) else 3 * x,
+    "all": lambda x: np.where(np.all(x > -0.5), 1.0, x),
+    "argmax": lambda x: x[np.argmax(x)],
+    "median": lambda x: np.median(x),
+    "unwrapped": lambda x: np.unwrap(4 * x),
+    "finite": lambda x: np.where(np.isfinite(x) & ~np.isnan(x), x, 0.0),
+    "fixed loop": lambda x: newton(x),
+    "array compared": lambda x: np.where(np.array([x[0], x[1]]) > 0, 1.0, x[:2]),
     "divided": lambda x: (
         1.0 / (2 + x**2) + x / 3 + np.true_divide(x, 2 + x**2) + np.float64(2.0) * x[0] - np.float64(1.0)
     ),
@@ -99,6 +135,17 @@ def test_values_and_jacobian(name):
         assert smooth[np.abs(numeric) < 1e3].mean() > 0.98
 
 
+def shrink(x):
+    while x[0] > 1:
+        x = x / 2
+    return x
+
+
+def fickle(x, calls=[]):  # noqa: B006
+    calls.append(1)
+    return x if x[len(calls) % 2] > 0 else -x
+
+
 def from_float_array(x):
     z = np.zeros(3)
     z[0] = x[1]
@@ -111,10 +158,10 @@ def counted(x, calls=[]):  # noqa: B006
 
 
 REFUSED = {
-    "if": (lambda x: x if x[0] > 0 else -x, "branches"),
-    "while": (lambda x: x if any(x > 0) else -x, "branches"),
-    "max": (lambda x: max(x[0], x[1]), "branches"),
-    "sorted": (lambda x: np.sort(x), "branches"),
+    "while": (lambda x: shrink(x), "too many ways"),
+    "many branches": (lambda x: [sum(1.0 for a in x if a > k / 9) for k in range(9)], "too many ways"),
+    "size": (lambda x: x if x[0] > 0 else x[:2], "size"),
+    "twice not the same": (lambda x: fickle(x), "same twice"),
     "math": (lambda x: math.sin(x[0]), "plain number"),
     "float array": (from_float_array, "plain number"),
     "astype": (lambda x: x.astype(float), "plain number"),
@@ -150,12 +197,30 @@ def test_a_function_that_is_random_or_counts_is_never_trusted():
 def test_a_function_that_hides_a_branch_is_found_out():
     def f(x):
         try:
-            return x if x[0] > 0 else -x
+            return x if float(x[0]) > 0 else -x
         except Exception:
             return x
 
     with pytest.raises(Untraceable, match="other values"):
         compiled(f, (2,), [(np.array([1.0, 2.0]),), (np.array([-1.0, 2.0]),)])
+
+
+def test_a_small_entry_that_is_wrong_is_not_hidden_by_a_large_one():
+    def f(x):
+        try:
+            small = 1e-9 if float(x[0]) > 0 else -1e-9
+        except Exception:
+            small = 1e-9
+        return np.array([1e12 + x[0], small])
+
+    with pytest.raises(Untraceable, match="other values"):
+        compiled(f, (1,), [(np.array([1.0]),), (np.array([-1.0]),)])
+
+
+def test_rounding_that_cancellation_has_made_large_is_no_difference():
+    # NumPy's power and the tape's product of three differ in the last place; the difference of large numbers shows it.
+    points = [(np.array([a]),) for a in np.linspace(1e5, 1e6, 50)]
+    assert compiled(lambda x: x**3 - np.floor(x) ** 3, (1,), points)
 
 
 def test_a_function_that_is_never_finite_is_not_trusted():
@@ -185,6 +250,19 @@ def test_several_arguments_none_and_a_number():
     tape = trace(lambda x, u, dt: np.array([x[0] + dt * u[1], x[1]]), (2, 2, None))
     np.testing.assert_array_equal(tape([[1.0, 2.0], [3.0, 4.0]], [5.0, 6.0], 0.5), [[4.0, 2.0], [6.0, 4.0]])
     assert tape.jacobian([1.0, 2.0], [5.0, 6.0], 0.5)[1].shape == (1, 2, 2)
+
+
+def test_a_condition_met_twice_is_decided_once():
+    calls = []
+
+    def f(x):
+        calls.append(1)
+        y = x if x[0] > 0 else -x
+        return y + 1 if x[0] > 0 else y - 1
+
+    tape = trace(f, (1,))
+    assert len(calls) == 2
+    np.testing.assert_array_equal(tape([[2.0], [-2.0]]), [[3.0], [1.0]])
 
 
 def test_equal_steps_are_shared_and_unused_ones_dropped():
@@ -235,8 +313,7 @@ def test_random_expressions(data):
     with np.errstate(all="ignore"):
         try:
             tape = trace(f, (2,))
-        except Untraceable as refusal:
-            assert "NaN" in str(refusal)
+        except Untraceable:  # a constant became NaN
             return
         expected = np.array([f(p) for p in points])
         got = tape(points)

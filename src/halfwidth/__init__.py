@@ -43,6 +43,7 @@ _HOME: dict[str, str] = {
     "BadValue": "errors",
     "BadRecord": "errors",
     "BadLog": "errors",
+    "LogTooBig": "errors",
     "Refused": "errors",
     "Missing": "errors",
     "Unsolved": "errors",
@@ -50,6 +51,9 @@ _HOME: dict[str, str] = {
     "Estimator": "methods._protocol",
     "Recursive": "methods._protocol",
 } | {name: f"methods.{module}" for name, module in ESTIMATORS.items()}
+
+#: Packages that are part of the public names, loaded when first used as well.
+_PACKAGES = ("vehicle",)
 
 __all__ = ["__version__", *sorted(_HOME)]
 
@@ -61,6 +65,7 @@ if TYPE_CHECKING:
     from halfwidth.errors import BadValue as BadValue
     from halfwidth.errors import DataQualityWarning as DataQualityWarning
     from halfwidth.errors import HalfwidthError as HalfwidthError
+    from halfwidth.errors import LogTooBig as LogTooBig
     from halfwidth.errors import Missing as Missing
     from halfwidth.errors import Refused as Refused
     from halfwidth.errors import Unsolved as Unsolved
@@ -70,6 +75,9 @@ if TYPE_CHECKING:
     from halfwidth.learn import learn as learn
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
+    from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
+    from halfwidth.methods.particle import ParticleFilter as ParticleFilter
     from halfwidth.model import Linear as Linear
     from halfwidth.model import Nonlinear as Nonlinear
     from halfwidth.noise import Gaussian as Gaussian
@@ -88,6 +96,8 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return importlib.import_module(f"halfwidth.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'halfwidth' has no attribute {name!r}")
     value = getattr(importlib.import_module(f"halfwidth.{_HOME[name]}"), name)

@@ -75,7 +75,7 @@ def from_continuous(
 
     def Qd(dt: float) -> Array:
         # Halving the step until the exponentials are tame, then doubling back: Q(2h) = Q(h) + A(h) Q(h) A(h)'.
-        halvings = max(0, int(np.ceil(np.log2(max(np.linalg.norm(a, 1) * abs(dt), 1e-300)))))
+        halvings = max(0, int(np.ceil(np.log2(max(float(np.linalg.norm(a, 1)) * abs(dt), 1e-300)))))
         h = dt / 2**halvings
         block = np.block([[-a, q], [np.zeros((n, n)), a.T]]) * h
         exponential = _expm(block)

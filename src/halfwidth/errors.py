@@ -7,6 +7,7 @@
     ├── BadValue     a number or an argument is out of its domain      (also a ValueError)
     ├── BadRecord    times, outputs or inputs cannot be used           (also a ValueError)
     ├── BadLog       a vehicle's log cannot be read                    (also a ValueError)
+    │   └── LogTooBig    it passes a limit of the reader
     ├── Refused      this method cannot work on this model             (also a TypeError)
     ├── Missing      an optional library is not installed              (also an ImportError)
     └── Unsolved     `Estimate.check()` met a status that is not good  (also a RuntimeError)
@@ -53,6 +54,10 @@ class BadRecord(HalfwidthError, ValueError):
 
 class BadLog(HalfwidthError, ValueError):
     """A vehicle's log cannot be read."""
+
+
+class LogTooBig(BadLog):
+    """A vehicle's log passes a limit of the reader."""
 
 
 class Refused(HalfwidthError, TypeError):

@@ -14,7 +14,12 @@ from halfwidth.record import Record
 from halfwidth.result import Estimate
 
 #: Methods tried in this order when none is given; the first that does not refuse the model runs.
-DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (("KalmanSmoother", {}), ("BatchLP", {}))
+DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("KalmanSmoother", {}),
+    ("UnscentedKalman", {"smooth": True}),
+    ("BatchLP", {}),
+    ("ParticleFilter", {}),
+)
 
 
 @overload

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from halfwidth import _core
+import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadRecord, BadValue, Refused, Unsolved, hinted
 from halfwidth.estimate import fits
@@ -180,7 +180,7 @@ def _started(model: Linear, free: Mapping[str, Any]) -> Linear:
     if not model.theta_entries:
         return model
     middle = np.zeros(len(model.theta_entries)) if model.theta_bounds is None else model.theta_bounds.mean
-    new = {name: model.matrices[name].single.copy() for name in free}
+    new: dict[str, Any] = {name: model.matrices[name].single.copy() for name in free}
     for entry, value in zip(model.theta_entries, middle, strict=True):
         new[entry.matrix][entry.row, entry.column] = value
     return dataclasses.replace(model, **new, theta_bounds=None)

@@ -205,7 +205,7 @@ class Nonlinear:
     Parameters
     ----------
     g : function (x, u) -> (nx,), or (x, u, dt), or (x)
-        Motion over one step of `dt` seconds. Written in NumPy without branching on values it runs compiled.
+        Motion over one step of `dt` seconds. Written with functions of NumPy (not of `math`) it runs compiled.
     h : function (x) -> (ny,)
         Output.
     w, e : Uniform, Gaussian or their sum
@@ -329,7 +329,7 @@ class Nonlinear:
         if given is not None and given.shape != (self.nu,):
             raise BadShape(f"`u` has shape {given.shape}, ({self.nu},) was expected from the model")
         rest: tuple[Any, ...] = (given, self.dt if dt is None else float(dt))
-        rows = []
+        rows: list[Array] = []
         for name, size, angles in (("g", self.nx, self.x_angles), ("h", self.ny, self.y_angles)):
             f = getattr(self, name)
             more = rest[: arity(f, 3 if name == "g" else 1) - 1]

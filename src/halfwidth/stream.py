@@ -73,7 +73,7 @@ class Stream:
         body = json.dumps(head).encode()
         state = self._core.snapshot()
         parts = _MAGIC + _VERSION.to_bytes(4, "little") + len(body).to_bytes(8, "little") + body + state
-        return parts + zlib.crc32(parts).to_bytes(4, "little")
+        return bytes(parts + zlib.crc32(parts).to_bytes(4, "little"))
 
     def __repr__(self) -> str:
         return f"Stream({typed(self.method)}, {self.rows} rows, t = {self.t:g} s)"

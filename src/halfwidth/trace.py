@@ -2,10 +2,11 @@
 
 The function is called with object arrays whose entries record every operation made with them; NumPy hands
 element-wise functions, products and sums through to the entries. What comes out is a straight-line program, a
-`Tape`: values at many points at once, and the exact Jacobian by forward mode [1]_. A function that branches on a
-value, or turns one into a float (``math.sin``, a float array written entry by entry, SciPy), cannot be recorded:
-`trace` raises `Untraceable`, and the caller keeps to Python. A tape is compared with its function at points before
-anything is built on it (`Tape.agrees`).
+`Tape`: values at many points at once, and the exact Jacobian by forward mode [1]_. Where the function branches on a
+value (``if``, ``max``, ``sorted``) it is called once for each way it can go, and the answers are joined by choices. A
+function that turns a value into a float (``math.sin``, a float array written entry by entry, SciPy), or loops until
+something is small, cannot be recorded: `trace` raises `Untraceable`, and the caller keeps to Python. A tape is compared
+with its function at points before anything is built on it (`Tape.agrees`).
 
 References
 ----------
@@ -26,7 +27,10 @@ _TURNED = (
     "a traced value was turned into a plain number; write `np.sin` rather than `math.sin`, and build arrays with "
     "`np.array([...])` or `np.zeros_like(x)` rather than filling a float array"
 )
-_BRANCHED = "it branches on a value; `np.where` can be traced, `if` cannot"
+_BRANCHED = "it branches on values in too many ways; a loop with a fixed number of rounds can be traced"
+
+#: Calls of a function to follow its branches, and branches on one way through it.
+_CALLS, _BRANCHES = 64, 24
 
 
 class Untraceable(Exception):
@@ -86,24 +90,31 @@ class Tape:
         return value, slope
 
     def agrees(self, f: Callable[..., Any], points: Iterable[tuple[Any, ...]]) -> bool:
-        """Whether the tape and the function give the same at every point where the function is finite.
+        """Return whether the tape and the function give the same at every point where the function is finite.
 
-        Rounding is allowed for (a few hundred units in the last place of the largest entry); one finite point at
-        least is needed to say yes.
+        Each entry may differ by what rounding of the arguments makes of it, 1e-12 relative; one finite point at least
+        is needed to say yes.
         """
+        from halfwidth._core import tape_jacobian
+
         tested = False
         for arguments in points:
             with np.errstate(all="ignore"):
-                expected = np.asarray(f(*_called(arguments, self.sizes)))
+                try:
+                    expected = np.asarray(f(*_called(arguments, self.sizes)))
+                except Exception:  # where it fails is for the caller to meet, and to name
+                    return False
                 if expected.dtype.kind not in "biuf" or expected.size != len(self.out):
                     return False
                 expected = expected.astype(np.float64).ravel()
-                got = self(*arguments)[0]
-            if not np.isfinite(expected).all():
-                continue
-            scale = np.abs(expected).max(initial=0.0) + np.finfo(np.float64).tiny
-            if not np.abs(got - expected).max() <= 1e-13 * 256 * scale:
-                return False
+                if not np.isfinite(expected).all():
+                    continue
+                point = self._points(arguments)
+                slope = tape_jacobian(self.code, self.constant, self.out, point, point.shape[1])[1][0]
+                felt = np.abs(slope) @ np.abs(point[0])
+                size = np.abs(expected) + np.where(np.isfinite(felt), felt, 0.0)
+                if not np.all(np.abs(self(*arguments)[0] - expected) <= 1e-12 * size + 1e-300):
+                    return False
             tested = True
         return tested
 
@@ -125,7 +136,7 @@ def trace(f: Callable[..., Any], sizes: Sequence[int | None]) -> Tape:
     Raises
     ------
     Untraceable
-        If `f` branches on a value, leaves NumPy, or fails.
+        If `f` leaves NumPy, branches in too many ways, or fails.
 
     Examples
     --------
@@ -137,20 +148,41 @@ def trace(f: Callable[..., Any], sizes: Sequence[int | None]) -> Tape:
             [4. , 3. ]]])
     """
     record = _Recorder()
-    arguments: list[Any] = []
-    entry = 0
-    for n in sizes:
-        variables = [record.step("input", entry + i) for i in range(1 if n is None else n)]
-        entry += len(variables)
-        arguments.append(variables[0] if n is None else _entries(variables) if n else None)
-    try:
-        with np.errstate(all="ignore"):
-            answer = f(*arguments)
-        slots = [record.slot(a) for a in np.asarray(answer, dtype=object).ravel()]
-    except Untraceable:
-        raise
-    except Exception as error:  # whatever NumPy or the function says to entries that are not numbers
-        raise Untraceable(f"{type(error).__name__}: {error}") from error
+    calls = 0
+
+    def call() -> list[int]:
+        nonlocal calls
+        calls += 1
+        if calls > _CALLS:
+            raise Untraceable(_BRANCHED)
+        arguments: list[Any] = []
+        entry = 0
+        for n in sizes:
+            variables = [record.step("input", entry + i) for i in range(1 if n is None else n)]
+            entry += len(variables)
+            arguments.append(variables[0] if n is None else _entries(variables) if n else None)
+        try:
+            with np.errstate(all="ignore"):
+                answer = f(*arguments)
+            return [record.slot(a) for a in np.asarray(answer, dtype=object).ravel()]
+        except Untraceable:
+            raise
+        except Exception as error:  # whatever NumPy or the function says to entries that are not numbers
+            raise Untraceable(f"{type(error).__name__}: {error}") from error
+
+    def explore(way: list[tuple[int, bool]]) -> list[int]:
+        # The answer on a way through the branches and on all that leave it later.
+        record.follow(way)
+        slots, taken = call(), list(record.taken)
+        for k in range(len(taken) - 1, len(way) - 1, -1):
+            condition, decision = taken[k]
+            other = explore([*taken[:k], (condition, not decision)])
+            if len(other) != len(slots):
+                raise Untraceable("its answer changes its size")
+            slots = [record.chosen(condition, a, b) for a, b in zip(slots, other, strict=True)]
+        return slots
+
+    slots = explore([])
     if not slots:
         raise Untraceable("it returns nothing")
     widths = tuple(1 if n is None else n for n in sizes)
@@ -195,26 +227,10 @@ _NAMES = {
     "asinh": "arcsinh", "atan": "arctan", "atan2": "arctan2", "atanh": "arctanh", "pow": "power",
     "true_divide": "divide", "mod": "remainder", "fmax": "maximum", "fmin": "minimum",
 }  # fmt: skip
-_TWO = frozenset(
-    [
-        "add",
-        "subtract",
-        "multiply",
-        "divide",
-        "power",
-        "arctan2",
-        "hypot",
-        "maximum",
-        "minimum",
-        "remainder",
-        "fmod",
-        "floor_divide",
-        "less",
-        "less_equal",
-        "equal",
-        "not_equal",
-    ]
-)
+_TWO = {
+    "add", "subtract", "multiply", "divide", "power", "arctan2", "hypot", "maximum", "minimum", "remainder", "fmod",
+    "floor_divide", "less", "less_equal", "equal", "not_equal",
+}  # fmt: skip
 _COMMUTING = frozenset({"add", "multiply", "hypot", "equal", "not_equal"})
 _SPLIT: dict[str, Callable[..., Any]] = {
     "positive": lambda a: a,
@@ -225,6 +241,8 @@ _SPLIT: dict[str, Callable[..., Any]] = {
     "degrees": lambda a: a * (180.0 / np.pi),
     "greater": lambda a, b: b < a,
     "greater_equal": lambda a, b: b <= a,
+    "isnan": lambda a: a != a,
+    "isfinite": lambda a: (a - a) == 0,
     "logical_and": lambda a, b: (a != 0) * (b != 0),
     "logical_or": lambda a, b: ((a != 0) + (b != 0)) != 0,
     "logical_xor": lambda a, b: (a != 0) != (b != 0),
@@ -243,6 +261,35 @@ class _Recorder:
     def __init__(self) -> None:
         self.steps: list[tuple[str, tuple[int, ...], float]] = []
         self.known: dict[tuple[str, tuple[int, ...], float, float], int] = {}
+        self.way: list[tuple[int, bool]] = []
+        self.taken: list[tuple[int, bool]] = []
+
+    def follow(self, way: list[tuple[int, bool]]) -> None:
+        """Start a call that decides its first conditions as `way` says."""
+        self.way, self.taken = way, []
+
+    def decide(self, slot: int) -> bool:
+        """Answer a branch: the way to follow, true beyond it, and the same again for the same condition."""
+        number = self.value(slot)
+        if number is not None:
+            return number != 0.0
+        for condition, decision in self.taken:
+            if condition == slot:
+                return decision
+        k = len(self.taken)
+        if k >= _BRANCHES:
+            raise Untraceable(_BRANCHED)
+        decision = True
+        if k < len(self.way):
+            condition, decision = self.way[k]
+            if condition != slot:
+                raise Untraceable("it does not do the same twice")
+        self.taken.append((slot, decision))
+        return decision
+
+    def chosen(self, condition: int, a: int, b: int) -> int:
+        """Return the slot of a choice."""
+        return a if a == b else self.step("where", condition, a, b).slot
 
     def step(self, name: str, *arguments: int, value: float = 0.0) -> "_Variable":
         # The sign belongs to the key: 0.0 == -0.0, but 1 / x tells them apart.
@@ -269,7 +316,7 @@ class _Recorder:
         raise Untraceable(f"it computes with a {type(a).__name__}")
 
     def value(self, slot: int) -> float | None:
-        """Number in a slot if it is a constant."""
+        """Return the number in a slot if it is a constant."""
         name, _, value = self.steps[slot]
         return value if name == "constant" else None
 
@@ -416,7 +463,7 @@ def _ufunc(ufunc: np.ufunc, method: str, inputs: Sequence[Any], kwargs: dict[str
 
 def _where(condition: Any, *values: Any) -> Any:
     if len(values) != 2:
-        raise Untraceable(_BRANCHED)
+        return np.where(_plain(condition), *values)
 
     def one(c: Any, a: Any, b: Any) -> Any:
         if not isinstance(c, _Variable):
@@ -448,7 +495,7 @@ def _function(f: Callable[..., Any], args: Sequence[Any], kwargs: dict[str, Any]
     return _ours(f(*plain, **{k: _plain(a) for k, a in kwargs.items()}))
 
 
-class _Array(np.ndarray):  # type: ignore[type-arg]
+class _Array(np.ndarray):
     """An object array whose comparisons and choices are recorded, not decided."""
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
@@ -457,13 +504,13 @@ class _Array(np.ndarray):  # type: ignore[type-arg]
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         return _function(func, args, kwargs)
 
-    def max(self, axis: Any = None, **kwargs: Any) -> Any:
+    def max(self, axis: Any = None, **kwargs: Any) -> Any:  # type: ignore[override]
         return _ufunc(np.maximum, "reduce", (self,), {"axis": axis, **kwargs})
 
-    def min(self, axis: Any = None, **kwargs: Any) -> Any:
+    def min(self, axis: Any = None, **kwargs: Any) -> Any:  # type: ignore[override]
         return _ufunc(np.minimum, "reduce", (self,), {"axis": axis, **kwargs})
 
-    def clip(self, a_min: Any = None, a_max: Any = None, **kwargs: Any) -> Any:
+    def clip(self, a_min: Any = None, a_max: Any = None, **kwargs: Any) -> Any:  # type: ignore[override]
         return _clip(self, a_min, a_max, **kwargs)
 
 
@@ -487,9 +534,9 @@ class _Variable:
     def __repr__(self) -> str:
         return f"<traced value {self.slot}>"
 
-    # What would decide on a value, or lose it, ends the trace.
+    # What would lose the value ends the trace; what asks it for a decision is called again for the other.
     def __bool__(self) -> bool:
-        raise Untraceable(_BRANCHED)
+        return self.record.decide(self.slot)
 
     def __float__(self) -> float:
         raise Untraceable(_TURNED)
@@ -505,7 +552,7 @@ class _Variable:
 
     def __invert__(self) -> Any:
         self._logical()
-        return self == 0
+        return self.record.apply("equal", self, 0.0)
 
     def _logical(self, other: Any = True) -> None:
         # `&`, `|` and `~` of numbers are bit operations, which a tape has not.
@@ -586,44 +633,18 @@ for _symbol, _name in {
     setattr(_Variable, f"__r{_symbol}__", _operator(_name, swapped=True))
 for _symbol, _name in {"lt": "less", "le": "less_equal", "eq": "equal", "ne": "not_equal"}.items():
     setattr(_Variable, f"__{_symbol}__", _operator(_name))
-_Variable.__gt__ = _operator("less", swapped=True)  # type: ignore[attr-defined]
-_Variable.__ge__ = _operator("less_equal", swapped=True)  # type: ignore[attr-defined]
+for _symbol, _name in {"gt": "less", "ge": "less_equal"}.items():
+    setattr(_Variable, f"__{_symbol}__", _operator(_name, swapped=True))
 for _symbol, _name in {"neg": "negative", "abs": "absolute", "pos": "positive", "floor": "floor", "ceil": "ceil",
                        "trunc": "trunc"}.items():  # fmt: skip
     setattr(_Variable, f"__{_symbol}__", _unary(_name))
 # NumPy's object loops call methods of the entries by the name of the function.
-for _name in [
-    "sqrt",
-    "cbrt",
-    "square",
-    "reciprocal",
-    "sign",
-    "exp",
-    "exp2",
-    "expm1",
-    "log",
-    "log2",
-    "log10",
-    "log1p",
-    "sin",
-    "cos",
-    "tan",
-    "arcsin",
-    "arccos",
-    "arctan",
-    "sinh",
-    "cosh",
-    "tanh",
-    "arcsinh",
-    "arccosh",
-    "arctanh",
-    "rint",
-    "deg2rad",
-    "rad2deg",
-    "radians",
-    "degrees",
-    "conjugate",
-]:
+_METHODS = (
+    "sqrt", "cbrt", "square", "reciprocal", "sign", "exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "sin",
+    "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh", "rint",
+    "deg2rad", "rad2deg", "radians", "degrees", "conjugate",
+)  # fmt: skip
+for _name in _METHODS:
     setattr(_Variable, _name, _unary(_name))
 for _name in ("arctan2", "hypot", "fmod"):
     setattr(_Variable, _name, _operator(_name))

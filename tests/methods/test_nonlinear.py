@@ -269,7 +269,7 @@ def test_a_branch_met_only_on_the_way_is_found_out():
 
     def g(x):
         try:
-            return x + 1.0 if x[0] < 5 else x + 2.0
+            return x + 1.0 if float(x[0]) < 5 else x + 2.0
         except Exception:
             return x + 1.0
 
@@ -279,6 +279,26 @@ def test_a_branch_met_only_on_the_way_is_found_out():
     assert est.info["evaluated"] == "python"
     assert "states found" in est.info["reason"]
     assert est.x[-1, 0] == pytest.approx(15.0)
+
+
+def test_branches_run_compiled():
+    """The usual special case for driving straight on, as users write it."""
+
+    def step(x, u, dt):
+        px, py, v, a, w = x
+        if abs(w) < 1e-4:
+            return np.array([px + v * dt * np.cos(a), py + v * dt * np.sin(a), v + u[0] * dt, a, w])
+        return ctrv_step(x, u, dt)
+
+    model = dataclasses.replace(ctrv(), g=step)
+    _, record = drive(ctrv(), 2)
+    for method in (ExtendedKalman(smooth=True), UnscentedKalman()):
+        est = hw.estimate(model, record, method)
+        assert est.info["evaluated"] == "compiled"
+        np.testing.assert_allclose(est.x, hw.estimate(ctrv(), record, method).x, rtol=1e-6, atol=1e-6)
+    straight = model.linearise([0.0, 0.0, 8.0, 0.5, 0.0], [0.1], by="tape")
+    np.testing.assert_allclose(straight.g[:2], [1.6 * np.cos(0.5), 1.6 * np.sin(0.5)])
+    np.testing.assert_array_equal(straight.g_x[3], [0, 0, 0, 1, 0])
 
 
 def test_jacobians_of_the_user():
@@ -511,6 +531,40 @@ def test_a_g_that_raises_later_is_named_with_its_time():
         hw.estimate(model, hw.Record(np.arange(9.0), np.full(9, np.nan)), ExtendedKalman())
 
 
+def test_functions_that_fail_far_away_do_no_harm():
+    """Tapes are tried at points that a run never meets; what happens there is not the user's problem."""
+
+    def g(x):
+        if abs(x[0]) > 2.5:
+            raise RuntimeError("too far")
+        return 0.5 * x
+
+    def h(x):
+        try:
+            far = abs(float(x[0])) > 2.5
+        except Exception:
+            far = False
+        if far:
+            raise RuntimeError("too far")
+        return x
+
+    def h_x(x):
+        if abs(x[0]) > 2.5:
+            raise RuntimeError("too far")
+        return np.eye(1)
+
+    record = hw.Record(np.arange(5.0), [0.1, None, 0.2, 0.1, 0.0])
+    settings = (hw.Gaussian(0.1), hw.Gaussian(0.1), hw.Normal([0.5], 1.0))
+    want = hw.estimate(hw.Nonlinear(lambda x: 0.5 * x, lambda x: x, *settings), record, ExtendedKalman())
+    for model in (
+        hw.Nonlinear(g, lambda x: x, *settings),
+        hw.Nonlinear(lambda x: 0.5 * x, h, *settings),
+        hw.Nonlinear(lambda x: 0.5 * x, lambda x: x, *settings, h_x=h_x),
+    ):
+        got = hw.estimate(model, record, ExtendedKalman())
+        np.testing.assert_allclose(got.x, want.x, rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -557,3 +611,18 @@ def test_row_by_row_equals_the_record():
         np.testing.assert_allclose(x, batch.x[-1], rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(P, batch.P[-1], rtol=1e-10, atol=1e-12)
         assert loglik == pytest.approx(batch.loglik, rel=1e-12)
+
+
+def test_a_nonlinear_model_is_smoothed_by_default():
+    _, record = drive(ctrv(), 4, T=30)
+    est = hw.estimate(ctrv(), record)
+    assert est.method == "UnscentedKalman(smooth=True)"
+    np.testing.assert_array_equal(est.x, hw.estimate(ctrv(), record, UnscentedKalman(smooth=True)).x)
+
+
+def test_many_records_and_frames():
+    _, one = drive(ctrv(), 4, T=30)
+    _, two = drive(ctrv(), 5, T=20)
+    several = hw.estimate(ctrv(), [one, two], UnscentedKalman())
+    for record, est in zip([one, two], several, strict=True):
+        np.testing.assert_array_equal(est.x, hw.estimate(ctrv(), record, UnscentedKalman()).x)

@@ -51,9 +51,16 @@ def wrapped(a: Array, wrap: Any) -> Array:
 def factor(S: Array) -> tuple[Array, bool]:
     """Return the Cholesky factor of a semidefinite matrix, vanished pivots left out, and whether it is one."""
     n = len(S)
+    tol = 16.0 * _EPS * (n + 1)
+    try:
+        L: Array = np.linalg.cholesky(S).astype(np.float64, copy=False)
+    except np.linalg.LinAlgError:
+        pass
+    else:
+        if np.all(np.diag(L) ** 2 > np.maximum(tol * np.diag(S), 1e-300)) and np.isfinite(L).all():
+            return L, True
     L = np.zeros((n, n))
     good = True
-    tol = 16.0 * _EPS * (n + 1)
     for j in range(n):
         p = S[j, j] - L[j, :j] @ L[j, :j]
         if p > tol * S[j, j] and p >= 1e-300 and np.isfinite(p):
@@ -66,6 +73,9 @@ def factor(S: Array) -> tuple[Array, bool]:
 
 def _solve(L: Array, b: Array) -> tuple[Array, Array]:
     """Return L^-1 b and (L L')^-1 b, zero along vanished pivots."""
+    if np.all(np.diag(L) > 0):
+        first: Array = np.linalg.solve(L, b).astype(np.float64, copy=False)
+        return first, np.asarray(np.linalg.solve(L.T, first), dtype=np.float64)
     half = np.array(b, dtype=np.float64)
     n = len(L)
     for i in range(n):

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from halfwidth import _core
+import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadRecord, BadValue
 from halfwidth.methods._protocol import typed

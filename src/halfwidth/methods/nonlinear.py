@@ -1,11 +1,11 @@
 """Extended and unscented Kalman filter and smoother for nonlinear models with Gaussian noise.
 
-``x[t] = g(x[t-1], u[t]) + w[t]``,  ``y[t] = h(x[t]) + e[t]``. The extended filter linearises g and h at the estimate [1]_;
-the unscented filter carries sigma points through them [2]_. With ``smooth=True`` a Rauch-Tung-Striebel pass uses the
-whole record. ``g`` and ``h`` are recorded once a run and then run compiled, the whole record in C++; where that is not
-possible the same algorithm runs in NumPy. ``info["evaluated"]`` says which, ``info["reason"]`` why; ``info["nis"]`` is the
-normalised square of each row's innovation, ``info["x0"]`` and ``info["P0"]`` the smoothed state one step before the first
-row.
+``x[t] = g(x[t-1], u[t]) + w[t]``, ``y[t] = h(x[t]) + e[t]``. The extended filter linearises g and h at the estimate
+[1]_; the unscented filter carries sigma points through them [2]_. With ``smooth=True`` a Rauch-Tung-Striebel pass
+uses the whole record. ``g`` and ``h`` are recorded once a run and then run compiled, the whole record in C++; where
+that is not possible the same algorithm runs in NumPy. ``info["evaluated"]`` says which, ``info["reason"]`` why;
+``info["nis"]`` is the normalised square of each row's innovation, ``info["x0"]`` and ``info["P0"]`` the smoothed
+state one step before the first row.
 
 References
 ----------
@@ -23,7 +23,7 @@ import numpy as np
 from halfwidth import methods
 from halfwidth.array import Array
 from halfwidth.derivative import differences
-from halfwidth.errors import BadShape, BadValue, Refused, hinted
+from halfwidth.errors import BadShape, BadValue, HalfwidthError, Refused, hinted
 from halfwidth.methods._deviations import Function, Spread, scan
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear, arity
@@ -188,7 +188,7 @@ class _Rows(NamedTuple):
         return tuple(None if a is None else float(a[k]) if a.ndim == 1 else a[k] for a in self.more)
 
     def columns(self) -> Array:
-        """The same as one matrix (T, number of inputs)."""
+        """Return the same as one matrix (T, number of inputs)."""
         blocks = [a.reshape(len(self.t), -1) for a in self.more if a is not None]
         return np.ascontiguousarray(np.concatenate(blocks, axis=1)) if blocks else np.empty((len(self.t), 0))
 
@@ -207,7 +207,7 @@ def _refuses(method: Method, model: Model) -> str | None:
     if model.bounds is not None:
         return f"`{name}` cannot keep `bounds`\nhint: model.as_gaussian() drops them, ParticleFilter() keeps them"
     if model.loss is not None:
-        return f"`{name}` cannot tell losses from outputs\nhint: ParticleFilter() on a model without `loss`, NaN where lost"
+        return f"`{name}` cannot tell losses from outputs\nhint: a model without `loss`, and NaN where y was lost"
     return None
 
 
@@ -396,7 +396,10 @@ def _same_slope(user: Callable[..., Any], name: str, tape: Tape, points: list[tu
     shape = (len(tape.out), tape.sizes[0])
     for arguments in points:
         wanted = arity(user, 3 if name == "g" else 1)
-        given = _valued(user, f"{name}_x", shape, (np.array(arguments[0]), *arguments[1:])[:wanted], 0.0)
+        try:
+            given = _valued(user, f"{name}_x", shape, (np.array(arguments[0]), *arguments[1:])[:wanted], 0.0)
+        except HalfwidthError:  # met on the way, it is named there
+            return False
         exact = tape.jacobian(*arguments)[1][0]
         if np.isfinite(exact).all() and not np.allclose(given, exact, rtol=1e-6, atol=1e-9 * np.abs(exact).max()):
             return False
@@ -420,7 +423,7 @@ def _judged(found: dict[str, Any], t: Array) -> tuple[Status, str | None]:
         "bad_g": (Status.COLLAPSED, "`g` was not finite, so the state was held, in"),
         "bad_h": (Status.REDUCED, "`h` was not finite, so the output was left out, in"),
         "contradicted": (Status.REDUCED, "an output without noise contradicts its certain prediction in"),
-        "repaired": (Status.REDUCED, "a covariance was kept positive semidefinite by leaving out a negative weight in"),
+        "repaired": (Status.REDUCED, "a covariance that a negative weight or rounding made indefinite was repaired in"),
     }
     status, parts = Status.OK, []
     for key, (meaning, words) in said.items():

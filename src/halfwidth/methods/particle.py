@@ -1,11 +1,12 @@
 """Bootstrap particle filter and smoother: any model, any noise that can be drawn; slow, and true in the limit.
 
 Particles are moved by the model with noise drawn from it and weighted by the density of what was seen [1]_. Gaussian
-output noise weights with its density, uniform noise keeps or drops, and of mixed noise the bounded part is drawn with the
-particle and the Gaussian part weights: the expectation of that weight is the density of the sum. With F the outputs are
-taken from the last to the first, ``y_i = C_i x + e_i - sum_j>i F_ij y_j``, and an unseen one is drawn, so that any entry
-may be missing. Weights are logarithms; particles are redrawn (systematically [2]_) when less than half of them count. The
-smoother draws trajectories backwards [3]_.
+output noise weights with its density and uniform noise keeps or drops. Of mixed noise the bounded part is drawn with
+the particle and the Gaussian part weights, since the expectation of that weight is the density of the sum; where its
+entries are independent that expectation is taken exactly. Independent outputs are taken from the last to the first,
+``y_i = C_i x + e_i - sum_j>i F_ij y_j``, and an unseen one that matters is drawn, so that any entry may be missing.
+Weights are logarithms; particles are redrawn, systematically [2]_, when less than half of them count. The smoother
+draws trajectories backwards [3]_.
 
 References
 ----------
@@ -40,8 +41,8 @@ class ParticleFilter:
     """Bootstrap particle filter, or smoother by backward simulation.
 
     The reference for what has no closed form: bounded, Gaussian and mixed noise, bounds on the state, nonlinear models.
-    The error of a mean falls with ``1 / sqrt(particles)``, and particles run out when the outputs are much sharper than the
-    prediction; then the status is COLLAPSED, the row's outputs are passed over, and the message names the time.
+    The error of a mean falls with ``1 / sqrt(particles)``, and particles run out when the outputs are much sharper than
+    the prediction; then the status is COLLAPSED, the row's outputs are passed over, and the message names the time.
 
     Parameters
     ----------
@@ -96,7 +97,7 @@ class ParticleFilter:
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:
         """Estimate the states; see `halfwidth.estimate`."""
         entropy = np.random.SeedSequence(seed).entropy
-        rng = np.random.default_rng(entropy)  # type: ignore[arg-type]
+        rng = np.random.default_rng(entropy)
         T, N, nx = len(record), self.particles, model.nx
         dt = record.steps(model.dt)
         motion = _motion(model, record, dt, compiled_=self.compiled)
@@ -104,7 +105,10 @@ class ParticleFilter:
         weigh = _weigher(model, record, dt, motion.output)
         kept = N if self.smooth or T * N * nx <= _KEPT else max(2, _KEPT // (T * nx))
 
-        x = np.array([model.x0.sample(rng) for _ in range(N)])
+        if isinstance(model.x0, Box):
+            x = rng.uniform(model.x0.lo, model.x0.hi, (N, nx))
+        else:
+            x = model.x0.mean + rng.standard_normal((N, nx)) @ _root(model.x0.P).T
         logw = np.zeros(N)
         mean = np.empty((T, nx))
         points, weights = np.empty((T, kept, nx)), np.empty((T, kept))
@@ -173,7 +177,8 @@ def _judged(collapsed: list[int], ess: Array, t: Array) -> tuple[Status, str | N
     if collapsed:
         k = collapsed[0]
         return Status.COLLAPSED, (
-            f"no particle explains row {k}, t = {t[k]:.6g} s ({len(collapsed)} of {len(t)} rows); its outputs were passed over"
+            f"no particle explains row {k}, t = {t[k]:.6g} s ({len(collapsed)} of {len(t)} rows); "
+            "its outputs were passed over"
         )
     k = int(np.argmin(ess))
     if ess[k] < 2.0:
@@ -285,12 +290,12 @@ def _nonlinear(model: Nonlinear, record: Record, dt: Array, *, compiled_: bool) 
     rng = np.random.default_rng(0)
     tests = [model.x0.mean + s * sd * rng.standard_normal(model.nx) for s in (0.0, 0.5, 1.0, 1.0, 2.0)]
     try:
-        if not compiled_:
-            raise Untraceable("not wanted")
         sizes = (model.nx, model.nu, None)[: arity(model.g, 3)]
         g = compiled(model.g, sizes, [(x, *more(0)) for x in tests])
         h = compiled(model.h, (model.nx,), [(x,) for x in tests])
     except Untraceable:
+        compiled_ = False
+    if not compiled_:
         return _Motion(
             lambda x, k: np.array([_finite(model.g, (p.copy(), *more(k)), model.nx) for p in x]),
             lambda x, k: np.array([_finite(model.h, (p.copy(),), model.ny) for p in x]),  # noqa: ARG005
@@ -320,39 +325,38 @@ def _weigher(
         v[:, turning] = _wrapped(v[:, turning])
         return v
 
-    def bounded(x: Array, k: int, rng: np.random.Generator) -> Array:
+    R = None if part is None else _rows(part.cov(), t, dt)
+
+    def independent(x: Array, k: int, rng: np.random.Generator, variance: Array) -> Array:
         assert q is not None
         Cx = output(x, k)
         f = np.eye(len(q)) if F is None else F(k)
         used = f[: int(np.flatnonzero(seen[k]).max(initial=-1)) + 1]
-        full = np.empty_like(Cx)
+        full = np.zeros_like(Cx)
         total = np.zeros(len(x))
         needed = seen[k] | (np.triu(used, 1) != 0).any(axis=0)
         for i in range(len(q) - 1, -1, -1):
             if not needed[i]:
-                full[:, i] = 0.0
                 continue
             mean = Cx[:, i] - full[:, i + 1 :] @ f[i, i + 1 :]
-            if not seen[k, i]:
+            if seen[k, i]:
+                full[:, i] = y[k, i]
+                v = wrap((y[k, i] - mean)[:, None], [i])[:, 0]
+                rounding = 8.0 * np.finfo(np.float64).eps * (abs(y[k, i]) + np.abs(mean))
+                total += _log_sum_density(v, q[i], float(np.sqrt(variance[i])), rounding)
+            else:
                 full[:, i] = mean + rng.uniform(-q[i], q[i], len(x))
-                continue
-            full[:, i] = y[k, i]
-            v = wrap((y[k, i] - mean)[:, None], [i])[:, 0]
-            rounding = 8.0 * np.finfo(np.float64).eps * (abs(y[k, i]) + np.abs(mean))
-            total[~(np.abs(v) <= q[i] + rounding)] = -np.inf
-            if q[i] > 0:
-                total -= np.log(2.0 * q[i])
+                full[:, i] += np.sqrt(variance[i]) * rng.standard_normal(len(x))
         return total
 
-    if part is None:
-        return lambda x, k, rng: bounded(x, k, rng) if seen[k].any() else np.zeros(len(x))
-    R = _rows(part.cov(), t, dt)
-
-    def gaussian(x: Array, k: int, rng: np.random.Generator) -> Array:
+    def weigh(x: Array, k: int, rng: np.random.Generator) -> Array:
         there = np.flatnonzero(seen[k])
         if not len(there):
             return np.zeros(len(x))
-        mean, S = output(x, k), R(k)
+        S = np.zeros((len(seen[k]),) * 2) if R is None else R(k)
+        if q is not None and not np.any(S - np.diag(np.diag(S))):
+            return independent(x, k, rng, np.diag(S))
+        mean = output(x, k)
         if q is not None:
             mean = mean + rng.uniform(-q, q, mean.shape)
         if F is not None:
@@ -361,7 +365,20 @@ def _weigher(
         v = wrap(y[k, there] - mean[:, there], there)
         return _log_normal(v, S[np.ix_(there, there)])
 
-    return gaussian
+    return weigh
+
+
+def _log_sum_density(v: Array, r: float, sd: float, rounding: Array) -> Array:
+    """Log-density at v of U(-r, r) + N(0, sd^2); without noise v must be rounding, and the density counts as 1."""
+    size = np.abs(v)
+    if sd <= 1e-9 * r or (sd == 0.0 and r == 0.0):
+        return np.asarray(np.where(size <= r + rounding, -np.log(2.0 * r) if r > 0 else 0.0, -np.inf))
+    if r <= 1e-7 * sd:
+        return np.asarray(-0.5 * (v / sd) ** 2 - np.log(sd) - 0.5 * _LOG_2PI)
+    from scipy.special import log_ndtr
+
+    near, far = log_ndtr((r - size) / sd), log_ndtr((-r - size) / sd)
+    return np.asarray(near + np.log1p(-np.exp(far - near)) - np.log(2.0 * r))
 
 
 def _log_normal(v: Array, S: Array) -> Array:
@@ -400,18 +417,22 @@ class _Density:
         self.cov = None if part is None else _rows(part.cov(), t, dt)
         self.angles = angles
 
-    def __call__(self, w: Array, k: int) -> Array:
-        """`w` is (M, N, nx); returns (M, N)."""
-        if self.angles:
+    def __call__(self, after: Array, moved: Array, k: int) -> Array:
+        """Of the noise between each of `moved` (N, nx) and each of `after` (M, nx); returns (M, N)."""
+        if self.cov is None or self.angles:
+            w = after[:, None, :] - moved[None, :, :]
             w[..., self.angles] = _wrapped(w[..., self.angles])
-        if self.cov is None:
-            assert self.q is not None
-            size = self.q * (1.0 + 1e-9)
-            return np.asarray(np.where((np.abs(w) <= size).all(axis=-1), 0.0, -np.inf))
-        S = self.cov(k)
-        root = np.linalg.cholesky(S)
-        z = np.linalg.solve(root, w.reshape(-1, len(S)).T)
-        return np.asarray(-0.5 * (z**2).sum(axis=0).reshape(w.shape[:2]))
+            if self.cov is None:
+                assert self.q is not None
+                return np.asarray(np.where((np.abs(w) <= self.q * (1.0 + 1e-9)).all(axis=-1), 0.0, -np.inf))
+            z = np.linalg.solve(np.linalg.cholesky(self.cov(k)), w.reshape(-1, w.shape[-1]).T)
+            return np.asarray(-0.5 * (z**2).sum(axis=0).reshape(w.shape[:2]))
+        root = np.linalg.cholesky(self.cov(k))
+        a, b = np.linalg.solve(root, after.T), np.linalg.solve(root, moved.T)  # (nx, M), (nx, N)
+        total = np.zeros((len(after), len(moved)))
+        for i in range(len(root)):
+            total -= 0.5 * (a[i][:, None] - b[i][None, :]) ** 2
+        return total
 
 
 def _backward(
@@ -426,9 +447,8 @@ def _backward(
         after = paths[k]
         if motion.fold is not None:
             after = np.linalg.solve(motion.fold(k), after.T).T  # E x
-        w = after[:, None, :] - motion.move(points[k - 1], k)[None, :, :]
         with np.errstate(divide="ignore"):
-            logw = density(w, k) + np.log(weights[k - 1])[None, :]
+            logw = density(after, motion.move(points[k - 1], k), k) + np.log(weights[k - 1])[None, :]
         # A row that collapsed may have left a trajectory without a parent: then any will do.
         lost = ~np.isfinite(logw.max(axis=1))
         with np.errstate(divide="ignore"):

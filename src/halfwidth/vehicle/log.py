@@ -72,6 +72,8 @@ class Log:
         What was recognised, repaired or dropped while reading, with counts.
     epoch_s : float, optional
         Unix time of ``t = 0`` where the source has absolute time; None where it has not.
+    columns : mapping of str to str
+        Which column of the source each role (time, lat, speed, ...) was read from.
 
     Raises
     ------
@@ -105,6 +107,7 @@ class Log:
     source: str = ""
     notes: tuple[str, ...] = ()
     epoch_s: float | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         t = _frozen("t", self.t)

@@ -182,7 +182,7 @@ class Track:
                     f"`{name}` is {getattr(self, name)[row]:.6g} m in row {row}, a half-width is not negative"
                 )
         if not 0 < self.level < 1:
-            raise BadValue(f"`level` is {self.level}, a probability between 0 and 1 is expected\nhint: 0.9")
+            raise BadValue(f"`level` is {self.level}, between 0 and 1 is expected", hint="level=0.9")
         if self.guarantee not in GUARANTEES:
             raise BadValue(f"`guarantee` is {self.guarantee!r}, one of {', '.join(GUARANTEES)} is expected")
         object.__setattr__(self, "gaps", tuple(self.gaps))
@@ -202,6 +202,11 @@ class Track:
         """(M,) array: the larger of the two half-widths, in metres."""
         larger: Floats = np.maximum(self.east_half_m, self.north_half_m)
         return larger
+
+    def rows_of(self, gap: Gap) -> tuple[int, int]:
+        """Find the rows of a gap, the fixes at its ends included: first row, row after the last."""
+        first = min(int(np.searchsorted(self.t_s, gap.start)), self.t_s.size - 1)
+        return first, max(int(np.searchsorted(self.t_s, gap.stop, side="right")), first + 1)
 
     def frame(self, native: str | None = None) -> Any:
         """Give the track as a data frame.

@@ -1,0 +1,5 @@
+"""``python -m halfwidth``: the command line."""
+
+from halfwidth.shells.cli import main
+
+main()

@@ -1,0 +1,1 @@
+"""Thin skins around `halfwidth.job.run`: the command line."""

@@ -1,0 +1,82 @@
+"""The vehicle: a drive with outages in, a track with honest half-widths out.
+
+Conventions: times in seconds, angles in radians clockwise from north, yaw rate positive to the left, latitude and
+longitude in degrees of WGS-84, local positions in metres east and north.
+"""
+
+import importlib
+import sys
+import types
+from typing import TYPE_CHECKING, Any
+
+#: Public names and the module of each, loaded when first used.
+_HOME: dict[str, str] = {
+    "Check": "check",
+    "Gap": "track",
+    "Frame": "frames",
+    "Limits": "formats",
+    "Log": "log",
+    "METHODS": "estimators",
+    "Outages": "outage",
+    "Track": "track",
+    "check": "check",
+    "constant_velocity": "models",
+    "ctrv": "models",
+    "fill": "fill",
+    "from_frame": "formats",
+    "gps_ins": "models",
+    "mat_nb": "frames",
+    "outages": "outage",
+    "read": "formats",
+    "simulate_drive": "drive",
+    "two_antenna": "models",
+    "two_antenna_linear": "models",
+}
+
+__all__ = sorted(_HOME)
+
+if TYPE_CHECKING:
+    from halfwidth.vehicle.check import Check as Check
+    from halfwidth.vehicle.check import check as check
+    from halfwidth.vehicle.drive import simulate_drive as simulate_drive
+    from halfwidth.vehicle.estimators import METHODS as METHODS
+    from halfwidth.vehicle.fill import fill as fill
+    from halfwidth.vehicle.formats import Limits as Limits
+    from halfwidth.vehicle.formats import from_frame as from_frame
+    from halfwidth.vehicle.formats import read as read
+    from halfwidth.vehicle.frames import Frame as Frame
+    from halfwidth.vehicle.frames import mat_nb as mat_nb
+    from halfwidth.vehicle.log import Log as Log
+    from halfwidth.vehicle.models import constant_velocity as constant_velocity
+    from halfwidth.vehicle.models import ctrv as ctrv
+    from halfwidth.vehicle.models import gps_ins as gps_ins
+    from halfwidth.vehicle.models import two_antenna as two_antenna
+    from halfwidth.vehicle.models import two_antenna_linear as two_antenna_linear
+    from halfwidth.vehicle.outage import Outages as Outages
+    from halfwidth.vehicle.outage import outages as outages
+    from halfwidth.vehicle.track import Gap as Gap
+    from halfwidth.vehicle.track import Track as Track
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'halfwidth.vehicle' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"halfwidth.vehicle.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return list(__all__)
+
+
+class _Package(types.ModuleType):
+    """The package: a public function keeps its name although the module that holds it is called the same."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # The import system binds every submodule it loads to the package; `vehicle.fill` must stay the function.
+        if not (name in _HOME and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,0 +1,493 @@
+"""What is wrong with a log, each point with a verdict, the number it rests on and what to type.
+
+Nothing is repaired here. Units, signs and conventions are judged against the fixes (`evidence`),
+times against themselves, values against what a car does. What the log cannot tell is said to be not
+checked, never guessed.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.vehicle import evidence
+from halfwidth.vehicle.log import STREAMS, Log
+from halfwidth.vehicle.repair import (
+    contradicted_convention,
+    contradicted_yaw,
+    matched_factor,
+    swapped_columns,
+)
+
+Floats = NDArray[np.float64]
+
+#: Version of what `Check.to_dict` gives.
+SCHEMA_VERSION = 1
+
+#: Steps coarser than these are worth a warning: (step, its unit, how it is said).
+_COARSE = {
+    "lat_deg": (1e-5, "deg", "about 1 m"),
+    "lon_deg": (1e-5, "deg", "about 1 m"),
+    "azimuth_rad": (0.0175, "rad", "1 degree"),
+    "speed_mps": (0.2, "m/s", "0.7 km/h"),
+    "yaw_rate_radps": (0.005, "rad/s", "0.3 deg/s"),
+    "ax_mps2": (0.2, "m/s2", "0.2 m/s2"),
+    "ay_mps2": (0.2, "m/s2", "0.2 m/s2"),
+}
+
+#: Slower than this the car stands (m/s).
+_STANDING = 0.1
+
+_LABEL = {
+    "position": "position",
+    "alt_m": "height",
+    "azimuth_rad": "azimuth",
+    "speed_mps": "speed",
+    "yaw_rate_radps": "yaw rate",
+    "ax_mps2": "acceleration x",
+    "ay_mps2": "acceleration y",
+}
+_ROLE = {"azimuth_rad": "azimuth", "speed_mps": "speed", "yaw_rate_radps": "yaw_rate"}
+_UNIT_AS_TYPED = {"speed is in km/h": "km/h", "speed is in mph": "mph", "speed is in knots": "kn",
+                  "speed is in m/s, not km/h": "m/s", "speed is in cm/s": "cm/s",
+                  "time is in milliseconds": "ms", "time is in microseconds": "us",
+                  "time is in nanoseconds": "ns"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Item:
+    """One point of a check.
+
+    Attributes
+    ----------
+    name : str
+        What was looked at.
+    verdict : str
+        ``"ok"``, ``"warn"``, ``"bad"`` or ``"not checked"``.
+    sentence : str
+        What was found, in words.
+    value : float or None
+        The number it rests on.
+    unit : str
+        Its unit, empty for a ratio.
+    line : str
+        What to type, empty where there is nothing to do.
+    """
+
+    name: str
+    verdict: str
+    sentence: str
+    value: float | None = None
+    unit: str = ""
+    line: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give the point as plain data."""
+        return {
+            "name": self.name,
+            "verdict": self.verdict,
+            "sentence": self.sentence,
+            "value": self.value,
+            "unit": self.unit,
+            "line": self.line or None,
+        }
+
+
+@dataclass(frozen=True)
+class Check:
+    """What was found in one log.
+
+    Attributes
+    ----------
+    source : str
+        The log.
+    rows, fixes : int
+    length_s : float
+        From the first row to the last, s.
+    items : tuple of Item
+    notes : tuple of str
+        What reading it recognised, repaired or dropped.
+    """
+
+    source: str
+    rows: int
+    fixes: int
+    length_s: float
+    items: tuple[Item, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def verdict(self) -> str:
+        """The worst of all verdicts: ``"ok"``, ``"warn"`` or ``"bad"``."""
+        found = {item.verdict for item in self.items}
+        return "bad" if "bad" in found else "warn" if "warn" in found else "ok"
+
+    def __getitem__(self, name: str) -> Item:
+        """Give one point by its name."""
+        for item in self.items:
+            if item.name == name:
+                return item
+        raise KeyError(name)
+
+    def summary(self) -> str:
+        """Give everything as text, the worst first."""
+        order = {"bad": 0, "warn": 1, "ok": 2, "not checked": 3}
+        width = max((len(item.name) for item in self.items), default=0)
+        lines = [
+            f"{self.source}: {self.verdict}",
+            f"{self.rows} rows, {self.length_s:.1f} s, {self.fixes} fixes",
+            "",
+        ]
+        for item in sorted(self.items, key=lambda item: order[item.verdict]):
+            lines.append(f"{item.verdict:<12}{item.name:<{width}}  {item.sentence}")
+            if item.line:
+                lines.append(f"{'':<{12 + width}}  type: {item.line}")
+        if self.notes:
+            lines += ["", "while reading:", *(f"  {note}" for note in self.notes)]
+        return "\n".join(lines) + "\n"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give everything as plain data for JSON."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "source": self.source,
+            "verdict": self.verdict,
+            "rows": self.rows,
+            "fixes": self.fixes,
+            "length_s": self.length_s,
+            "items": [item.to_dict() for item in self.items],
+            "notes": list(self.notes),
+        }
+
+    def __repr__(self) -> str:
+        n = {verdict: sum(item.verdict == verdict for item in self.items) for verdict in ("bad", "warn", "ok")}
+        return f"Check({self.source!r}: {self.verdict}, {n['bad']} bad, {n['warn']} warn, {n['ok']} ok)"
+
+
+def check(log: Any) -> Check:
+    """Say what is wrong with a log.
+
+    Parameters
+    ----------
+    log : Log, path or table
+        A path or table is read without putting units and signs right, so that they are reported.
+
+    Returns
+    -------
+    Check
+
+    Raises
+    ------
+    BadLog
+        If it cannot be read.
+
+    Examples
+    --------
+    >>> log = Log(t=range(5), lat_deg=[50.0] * 5, lon_deg=[14.0] * 5, speed_mps=[0.0] * 5)
+    >>> check(log)["standstill"].value
+    1.0
+    """
+    from halfwidth.vehicle.formats import from_frame, read
+
+    if isinstance(log, str) or hasattr(log, "__fspath__"):
+        log = read(log, repair=False)
+    elif not isinstance(log, Log):
+        log = from_frame(log, repair=False)
+    swapped = _swapped(log)
+    if swapped.verdict == "bad":
+        first = "put latitude and longitude right first"
+        moving = tuple(Item(name, "not checked", first) for name in ("outliers", "speed", "azimuth", "yaw rate"))
+    else:
+        moving = (_outliers(log), _speed(log), _azimuth(log), _yaw(log))
+    items = (
+        _streams(log),
+        _rates(log),
+        _gaps(log),
+        _pauses(log),
+        swapped,
+        *moving,
+        _standstill(log),
+        *_steps(log),
+        _speed_scale(log),
+        _yaw_bias(log)
+        if moving[3].verdict != "bad"
+        else Item("yaw bias", "not checked", "put the yaw rate right first"),
+        Item("clock offset", "not checked", "the offset between fixes and sensors is not estimated yet"),
+    )
+    length = float(log.t[-1] - log.t[0]) if len(log) else 0.0
+    return Check(log.source, len(log), int(log.fixed.sum()), length, items, log.notes)
+
+
+def _there(log: Log, name: str) -> bool:
+    return bool(np.isfinite(getattr(log, name)).any())
+
+
+def _typed(log: Log, name: str, unit: str, sign: str = "") -> str:
+    role = _ROLE.get(name, name)
+    column = log.columns.get(role, "COLUMN")
+    return f"--columns '{role}={sign}{column}[{unit}]'"
+
+
+def _streams(log: Log) -> Item:
+    there = [_LABEL[name] for name in _LABEL if name == "position" or _there(log, name)]
+    lacking = [_LABEL[name] for name in ("speed_mps", "yaw_rate_radps") if not _there(log, name)]
+    text = f"found {', '.join(there)}"
+    if not log.fixed.any():
+        return Item("streams", "bad", "there is no position", 0.0)
+    if lacking:
+        return Item(
+            "streams",
+            "warn",
+            f"{text}; no {' and no '.join(lacking)}, so gaps are bridged from the fixes around them alone",
+            float(len(there)),
+            line="--columns " + ",".join(f"{name.replace(' ', '_')}=COLUMN" for name in lacking),
+        )
+    return Item("streams", "ok", text, float(len(there)))
+
+
+def _rates(log: Log) -> Item:
+    rates = log.rates()
+    said = ", ".join(f"{_LABEL[name]} {rate:.3g} Hz" for name, rate in rates.items() if rate)
+    position = rates["position"]
+    slow = [name for name in ("speed_mps", "yaw_rate_radps") if (rate := rates[name]) is not None and rate < 0.5]
+    if slow:
+        return Item("rates", "warn", f"{said}; below 0.5 Hz a turn is over between two samples", rates[slow[0]], "Hz")
+    return Item("rates", "ok", said or "no stream has two samples", position, "Hz")
+
+
+def _gaps(log: Log) -> Item:
+    gaps = log.gaps()
+    if not gaps:
+        return Item("gaps", "ok", "no gaps between fixes", 0.0, "s")
+    lengths = [stop - start for start, stop in gaps]
+    k = int(np.argmax(lengths))
+    share = sum(lengths) / float(log.t[-1] - log.t[0])
+    return Item(
+        "gaps",
+        "ok",
+        f"{len(gaps)} gap{'s' * (len(gaps) > 1)} between fixes, {100 * share:.2g} % of the time, the longest"
+        f" {lengths[k]:.1f} s from {gaps[k][0]:.1f} s on",
+        lengths[k],
+        "s",
+    )
+
+
+def _pauses(log: Log) -> Item:
+    """Look for times at which the sensors that bridge a gap are silent as well."""
+    worst: tuple[float, float, str] | None = None
+    for name in ("speed_mps", "yaw_rate_radps"):
+        t = log.stream(name)[0]
+        if t.size < 2:
+            continue
+        step = np.diff(t)
+        k = int(np.argmax(step))
+        if step[k] > max(1.5, 5 * float(np.median(step))) and (worst is None or step[k] > worst[0]):
+            worst = (float(step[k]), float(t[k]), _LABEL[name])
+    if worst is None:
+        return Item("pauses", "ok", "speed and yaw rate arrive without long pauses", 0.0, "s")
+    length, start, name = worst
+    dead = any(a < start + length and start < b for a, b in log.gaps())
+    also = ", and no fix came either: nothing is known there" if dead else ""
+    return Item("pauses", "warn", f"no {name} for {length:.1f} s from {start:.1f} s on{also}", length, "s")
+
+
+def _swapped(log: Log) -> Item:
+    name = "latitude, longitude"
+    if swapped_columns(log):
+        lat, lon = log.columns.get("lat", "COLUMN"), log.columns.get("lon", "COLUMN")
+        return Item(
+            name,
+            "bad",
+            "swapped: only so do speed and course fit the fixes",
+            line=f"--columns 'lat={lon},lon={lat}'",
+        )
+    if not log.fixed.any():
+        return Item(name, "not checked", "there is no position")
+    lat_deg, lon_deg = float(np.nanmedian(log.lat_deg)), float(np.nanmedian(log.lon_deg))
+    ns, ew = "N" if lat_deg >= 0 else "S", "E" if lon_deg >= 0 else "W"
+    return Item(name, "ok", f"around {abs(lat_deg):.4f} {ns}, {abs(lon_deg):.4f} {ew}")
+
+
+def _outliers(log: Log) -> Item:
+    """Look for jumps that neither the speed nor the scatter of the fixes explains."""
+    t, position = log.stream("position")
+    if t.size < 3:
+        return Item("outliers", "not checked", "too few fixes")
+    speed = log.stream("speed_mps")[1]
+    found = evidence.speed_ratio(log)
+    trusted = speed.size > 0 and found.enough and abs(np.log(max(found.value, 1e-9))) < 0.2
+    top = 1.3 * float(np.max(np.abs(speed))) + 3.0 if trusted else 70.0
+    bad = evidence.impossible_fixes(t, position[:, 0], position[:, 1], top, 12.0)
+    share = float(bad.mean())
+    if not bad.any():
+        return Item("outliers", "ok", "no fix jumps further than speed and fix error explain", 0.0)
+    times = ", ".join(f"{when:.1f}" for when in t[bad][:5])
+    more = ", ..." if int(bad.sum()) > 5 else ""
+    return Item(
+        "outliers",
+        "bad" if share > 0.05 else "warn",
+        f"{int(bad.sum())} of {bad.size} fixes jump further than a speed of {top:.0f} m/s explains, at {times}{more} s",
+        float(bad.sum()),
+    )
+
+
+def _speed(log: Log) -> Item:
+    if not _there(log, "speed_mps"):
+        return Item("speed", "not checked", "there is no speed")
+    found = evidence.speed_ratio(log)
+    if not found.enough:
+        return Item("speed", "not checked", "the car hardly moves between fixes")
+    row = matched_factor(found)
+    text = f"speed is {found.value:.3f} times the distance between fixes over time"
+    if row is not None:
+        name = "speed_mps" if row[3] == 1 else "time"
+        return Item("speed", "bad", f"{text}: {row[1]}", found.value, line=_typed(log, name, _UNIT_AS_TYPED[row[1]]))
+    if abs(found.value - 1) > 0.1:
+        return Item("speed", "bad", f"{text}, 1 is expected and no known unit explains it", found.value)
+    if abs(found.value - 1) > 0.04:
+        return Item("speed", "warn", f"{text}, 1 is expected", found.value)
+    return Item("speed", "ok", text, found.value)
+
+
+def _azimuth(log: Log) -> Item:
+    if not _there(log, "azimuth_rad"):
+        return Item("azimuth", "not checked", "there is no azimuth")
+    ours = evidence.course_errors(log)["radians clockwise from north"]
+    if not ours.enough:
+        return Item("azimuth", "not checked", "the car hardly moves between fixes")
+    degrees = float(np.degrees(ours.value))
+    text = f"azimuth and course between fixes differ by {degrees:.1f} degrees in the middle"
+    convention = contradicted_convention(log)
+    if convention is not None:
+        degrees_given = convention.startswith("degrees")
+        line = ""
+        if convention.endswith("clockwise from north"):
+            sign = "-" if "counter" in convention else ""
+            line = _typed(log, "azimuth_rad", "deg" if degrees_given else "rad", sign)
+        return Item("azimuth", "bad", f"{text}: it is in {convention}", degrees, "deg", line)
+    if degrees > 20:
+        return Item("azimuth", "bad", f"{text}, no known convention explains it", degrees, "deg")
+    if degrees > 6:
+        return Item("azimuth", "warn", text, degrees, "deg")
+    return Item("azimuth", "ok", text, degrees, "deg")
+
+
+def _yaw(log: Log) -> Item:
+    if not _there(log, "yaw_rate_radps"):
+        return Item("yaw rate", "not checked", "there is no yaw rate")
+    found = evidence.turning(log)
+    if not found.enough:
+        return Item("yaw rate", "not checked", "the car hardly turns between fixes", None)
+    text = f"the course changes {found.slope:.3f} times as much as the yaw rate says"
+    factor = contradicted_yaw(found)
+    if factor is not None:
+        unit = "deg/s" if abs(factor) < 0.5 else "rad/s"
+        wrong = [] if abs(factor) == 1 else [f"it is in {unit}"]
+        wrong += ["its sign is that of a turn to the right"] if factor < 0 else []
+        line = _typed(log, "yaw_rate_radps", unit, "-" if factor < 0 else "")
+        return Item("yaw rate", "bad", f"{text}: {' and '.join(wrong)}", found.slope, "", line)
+    if abs(found.slope - 1) > 0.25:
+        return Item("yaw rate", "warn", f"{text}, 1 is expected", found.slope)
+    return Item("yaw rate", "ok", text, found.slope)
+
+
+def _standstill(log: Log) -> Item:
+    t, speed = log.stream("speed_mps")
+    if t.size < 2:
+        return Item("standstill", "not checked", "there is no speed")
+    still = (np.abs(speed[:-1]) < _STANDING) & (np.abs(speed[1:]) < _STANDING)
+    share = float(np.diff(t)[still].sum() / (t[-1] - t[0]))
+    return Item("standstill", "ok", f"the car stands {100 * share:.0f} % of the time", share)
+
+
+def quantisation(values: Floats) -> float | None:
+    """Give the step that all values are multiples of, None if they have none.
+
+    Rounding of the step itself is allowed for: 5 km/h written as 1.3889 m/s counts.
+    """
+    distinct = np.unique(values)
+    if distinct.size < 3:
+        return None
+    offset = distinct - distinct[0]
+    step = np.diff(distinct)
+    step = step[step > 1e-9 * max(1.0, float(np.abs(distinct).max()))]
+    if step.size == 0:
+        return None
+    guess = float(np.quantile(step, 0.02, method="lower"))
+    whole = np.round(offset / guess)
+    # a wrong guess of a coarse step adds up: fit it over near multiples first
+    near = (whole > 0) & (whole < 50)
+    if near.any():
+        guess = float(np.median(offset[near] / whole[near]))
+        whole = np.round(offset / guess)
+    off = np.abs(offset / guess - whole)
+    return guess if float((off < 0.12).mean()) > 0.95 else None
+
+
+def _steps(log: Log) -> list[Item]:
+    """Look at the quantisation of each stream."""
+    items = []
+    for name in STREAMS:
+        values = log.stream(name)[1]
+        if name not in _COARSE or values.size < 20:
+            continue
+        limit, unit, words = _COARSE[name]
+        step = quantisation(values)
+        title = f"step of {name}"
+        if step is None:
+            items.append(Item(title, "ok", "no quantisation step found", None, unit))
+        elif step > limit:
+            items.append(
+                Item(
+                    title,
+                    "warn",
+                    f"values come in steps of {step:.4g} {unit}, coarser than {words}: an error of up to"
+                    f" {step / 2:.2g} {unit} is built in",
+                    step,
+                    unit,
+                )
+            )
+        else:
+            items.append(Item(title, "ok", f"values come in steps of {step:.4g} {unit}", step, unit))
+    return items
+
+
+def _speed_scale(log: Log) -> Item:
+    """Give the speed's scale only where the windows agree well enough to tell it from noise."""
+    found = evidence.speed_ratio(log)
+    if not found.enough or found.n < 50 or found.spread > 0.03 or abs(found.value - 1) > 0.15:
+        return Item("speed scale", "not checked", "the fixes are too rough, or too few, to tell it")
+    percent = 100 * (found.value - 1)
+    return Item(
+        "speed scale",
+        "warn" if abs(percent) > 5 else "ok",
+        f"roughly {percent:+.1f} %, windows scatter by {100 * found.spread:.1f} %",
+        found.value,
+    )
+
+
+def _yaw_bias(log: Log) -> Item:
+    """Give the yaw rate's mean while the car stands, which is its bias."""
+    name = "yaw bias"
+    t_speed, speed = log.stream("speed_mps")
+    t, rate = log.stream("yaw_rate_radps")
+    if t_speed.size < 2 or t.size < 2:
+        return Item(name, "not checked", "it needs speed and yaw rate")
+    pair = np.searchsorted(t_speed, t).clip(1, t_speed.size - 1)
+    still = (
+        (np.abs(speed[pair]) < _STANDING)
+        & (np.abs(speed[pair - 1]) < _STANDING)
+        & (t_speed[pair] - t_speed[pair - 1] < 2)
+    )
+    held = float(np.diff(t, prepend=t[0])[still].clip(max=1.0).sum())
+    if held < 5 or int(still.sum()) < 10:
+        return Item(name, "not checked", "the car does not stand long enough to tell it")
+    bias = float(np.median(rate[still]))
+    return Item(
+        name,
+        "warn" if abs(bias) > 0.02 else "ok",
+        f"{bias:+.4f} rad/s while the car stands ({held:.0f} s)",
+        bias,
+        "rad/s",
+    )

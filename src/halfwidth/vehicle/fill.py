@@ -1,0 +1,518 @@
+"""Fill a drive: a position with a half-width for every row of a log that had, or could have had, a fix.
+
+The log is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
+gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened by what
+hiding the log's own fixes shows (`calibrate`). A method that fails on a piece is replaced by a simpler one there, and
+the track says so.
+
+Positions are those that the receiver would have reported. What it is wrong by for minutes at a time is in the fixes on
+both sides of a gap and in the filling between them, and hiding fixes cannot show it. The chain learns how large that
+slow error is (its fix offset), and the half-widths have it added:
+
+    half = z sqrt(inflation^2 (variance of the path + variance of a fix) + variance of the slow error)
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.errors import BadLog, BadValue
+from halfwidth.vehicle import calibrate, chain
+from halfwidth.vehicle.estimators import METHODS, Method, heading_of, usable
+from halfwidth.vehicle.estimators import method as method_of
+from halfwidth.vehicle.grid import Grid, sampled
+from halfwidth.vehicle.log import Log
+from halfwidth.vehicle.path import Path
+from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
+
+Floats = NDArray[np.float64]
+
+#: A piece is about this long, with this much context on both sides; a pause of the whole log ends a piece, s.
+PIECE, CONTEXT, PAUSE = 600.0, 60.0, 60.0
+
+#: A pause between fixes of this length is a gap even where it is usual in the log, s.
+LONG = 5.0
+
+#: Fixes that a method with a model of motion needs.
+FEWEST = 5
+
+#: Rounds in which the chain is solved again with hidden fixes, its scales kept.
+_AGAIN = 3
+
+
+def fill(
+    log: Any,
+    *,
+    method: str | None = None,
+    level: float = 0.9,
+    clock_offset: float | None = None,
+) -> Track:
+    """Fill the gaps of a log.
+
+    Parameters
+    ----------
+    log : Log, path or frame
+        What `halfwidth.vehicle.read` returns or takes, or a pandas, polars or pyarrow frame with such columns. Rows
+        with a time but no fix are where a position is wanted.
+    method : str, optional
+        Name of an estimator; if absent the best that the log's sensors allow.
+    level : float
+        Probability of the half-widths, between 0 and 1.
+    clock_offset : float, optional
+        Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; 0 if
+        absent.
+
+    Returns
+    -------
+    Track
+        Every fix, every row between fixes that are further apart than 1.5 times the usual, and every row before the
+        first and after the last fix.
+
+    Raises
+    ------
+    BadLog
+        If the log cannot be read or has no fix.
+    BadValue
+        If `level`, `method` or `clock_offset` is none.
+    """
+    if not 0 < level < 1:
+        raise BadValue(f"`level` is {level!r}, a probability between 0 and 1 is expected", hint="0.9")
+    asked = None if method is None else method_of(method)
+    drive_log, native = as_log(log)
+    if not drive_log.fixed.any():
+        raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
+    offset = 0.0 if clock_offset is None else float(clock_offset)
+    grid = sampled(drive_log, clock_offset=offset)
+    messages: list[str] = []
+    chosen = _chosen(grid, asked, messages)
+    if clock_offset is None and chosen.name not in ("linear", "cv"):
+        messages.append("the clocks of fixes and sensors were taken to agree")
+    wanted, quality = _wanted(drive_log)
+    t = drive_log.t[wanted]
+    pieces = _pieces(grid, drive_log)
+    answers = _estimated(pieces, chosen, _spans(drive_log, t, quality), level, messages)
+    columns = _read(answers, pieces, t)
+    away, length = _distance_in_time(drive_log, t)
+    z = NormalDist().inv_cdf(0.5 + level / 2)
+    half = _half_widths(columns, answers, grid, away, length, z, quality)
+    lat, lon = grid.frame.to_geodetic(columns.east, columns.north)
+    gaps = gaps_of(t, lat, lon, half.max(axis=1), quality)
+    settings: dict[str, object] = {"clock_offset": offset, "context": CONTEXT}
+    settings.update(answers.settings)
+    return Track(
+        t_s=t,
+        lat_deg=lat,
+        lon_deg=lon,
+        alt_m=_altitude(drive_log, t),
+        azimuth_rad=np.mod(columns.azimuth, 2 * np.pi),
+        speed_mps=columns.speed,
+        east_half_m=half[:, 0],
+        north_half_m=half[:, 1],
+        quality=quality,
+        since_fix_s=since_fix_of(t, quality),
+        level=level,
+        method=chosen.name,
+        log=drive_log,
+        gaps=gaps,
+        guarantee="credible",
+        benchmark=tuple(asdict(one) for one in answers.tested) or None,
+        settings=settings,
+        messages=tuple(messages),
+        native=native,
+    )
+
+
+def as_log(given: Any) -> tuple[Log, str]:
+    """Return a log from a log, a path or a frame, and the name of the library that its frames come from."""
+    if isinstance(given, Log):
+        return given, "pandas"
+    from halfwidth.vehicle.formats import from_frame, read
+
+    if isinstance(given, str | os.PathLike):
+        return read(given), "pandas"
+    library = type(given).__module__.partition(".")[0]
+    return from_frame(given), library if library in ("pandas", "polars", "pyarrow") else "pandas"
+
+
+# ---- which method, which rows, which pieces ------------------------------------------------------------------------
+
+
+def _chosen(grid: Grid, asked: Method | None, messages: list[str]) -> Method:
+    """Choose the best method that the sensors allow, and say why it is not the usual one."""
+    lacks = None if asked is None else asked.lacks(grid)
+    if asked is not None and lacks is None:
+        return asked
+    if asked is not None:
+        messages.append(f"`{asked.name}` needs the {lacks}, which the log does not have")
+    n = int(grid.seen.sum())
+    if n < FEWEST:
+        messages.append(f"the log has only {n} fix{'es' if n > 1 else ''}: straight lines between them")
+        return METHODS["linear"]
+    if not grid.has_speed and not grid.has_yaw_rate:
+        messages.append("the log has neither speed nor yaw rate: gaps are filled by constant velocity")
+        return METHODS["cv"]
+    if not grid.has_speed:
+        messages.append("the log has no speed: in gaps it is taken to change evenly from one side to the other")
+    if not grid.has_yaw_rate:
+        messages.append("the log has no yaw rate: in gaps the turning is guessed from both sides")
+    return METHODS["em"]
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _wanted(log: Log) -> tuple[NDArray[np.intp], NDArray[np.str_]]:
+    """Return the rows that a track has, and the quality of each."""
+    t, fixed = log.t, log.fixed
+    times = t[fixed]
+    quality = np.where(fixed, "fix", "").astype("<U12")
+    quality[~fixed & ((t < times[0]) | (t > times[-1]))] = "extrapolated"
+    for start, stop in _gaps(log):
+        a, b = np.searchsorted(t, start, side="right"), np.searchsorted(t, stop)
+        quality[a:b] = "bridged"
+    rows = np.flatnonzero(quality != "")
+    return rows, quality[rows]
+
+
+def _gaps(log: Log) -> list[tuple[float, float]]:
+    """Return the log's gaps and every other pause between fixes that is long for any receiver."""
+    times = log.t[log.fixed]
+    long = np.flatnonzero(np.diff(times) > LONG)
+    return sorted({*log.gaps(), *((float(times[k]), float(times[k + 1])) for k in long)})
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """A part of the drive: the span it answers for, and its grid, which reaches further."""
+
+    start: float
+    stop: float
+    grid: Grid
+
+
+def _pieces(grid: Grid, log: Log) -> list[_Piece]:
+    """Cut a drive where the log pauses and, if it is long, every ten minutes at a fix."""
+    rest = np.flatnonzero(np.diff(log.t) > PAUSE)
+    blocks = [(log.t[a], log.t[b]) for a, b in zip([0, *(rest + 1)], [*rest, len(log) - 1], strict=True)]
+    merged: list[tuple[float, float]] = []
+    held = False
+    for start, stop in blocks:
+        has_fix = bool(grid.seen[(grid.t >= start) & (grid.t <= stop)].any())
+        # a block without a fix cannot stand alone
+        if merged and (held or not has_fix):
+            merged[-1] = (merged[-1][0], stop)
+            held = held and not has_fix
+        else:
+            merged.append((start, stop))
+            held = not has_fix
+    pieces = []
+    for start, stop in merged:
+        cuts = [start]
+        fixes = grid.t[grid.seen & (grid.t > start) & (grid.t < stop)]
+        while stop - cuts[-1] > 1.5 * PIECE:
+            k = int(np.searchsorted(fixes, cuts[-1] + PIECE))
+            if k >= fixes.size or stop - fixes[k] < 1.0:
+                break
+            cuts.append(float(fixes[k]))
+        for a, b in zip(cuts, [*cuts[1:], stop], strict=True):
+            part = grid.between(max(start, a - CONTEXT) - 1e-9, min(stop, b + CONTEXT) + 1e-9)
+            pieces.append(_Piece(a, b, part))
+    return pieces
+
+
+def _spans(log: Log, t: Floats, quality: NDArray[np.str_]) -> Floats:
+    """Return the lengths of the stretches to be filled, s."""
+    fixes = log.t[log.fixed]
+    lengths = [stop - start for start, stop in _gaps(log) if np.any((t > start) & (t < stop))]
+    if np.any(quality == "extrapolated"):
+        lengths += [s for s in (fixes[0] - log.t[0], log.t[-1] - fixes[-1]) if s > 0]
+    return np.array(lengths)
+
+
+def _distance_in_time(log: Log, t: Floats) -> tuple[Floats, Floats]:
+    """Return for each row the time to the nearest fix, and the length of the stretch without fixes it lies in, s."""
+    fixes = log.t[log.fixed]
+    k = np.searchsorted(fixes, t)
+    after = np.where(k < fixes.size, fixes[np.minimum(k, fixes.size - 1)] - t, np.inf)
+    before = np.where(k > 0, t - fixes[np.maximum(k - 1, 0)], np.inf)
+    on_fix = after == 0
+    away = np.where(on_fix, 0.0, np.minimum(before, after))
+    length = np.where(on_fix, 0.0, np.where(np.isfinite(before + after), before + after, 2 * away))
+    return away, length
+
+
+#: Names of what the chain finds, as the settings of a track have them.
+_WORDS = {"speed_scale": "speed scale", "yaw_bias": "yaw bias", "slow_sd": "slow error of the fixes"}
+
+
+# ---- estimating ----------------------------------------------------------------------------------------------------
+
+#: Fills drives of which fixes were hidden; the numbers say which grid each comes from.
+Rerun = Callable[[Sequence[int], Sequence[Grid]], list[Path]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Answers:
+    """Paths of the pieces, what hiding fixes showed, and what was found on the way."""
+
+    paths: list[Path]
+    tested: list[calibrate.Tested]
+    least: float
+    settings: dict[str, object]
+
+
+def _estimated(
+    pieces: Sequence[_Piece], chosen: Method, lengths: Floats, level: float, messages: list[str]
+) -> _Answers:
+    """Estimate every piece, with simpler methods where the chosen one fails, and test the intervals."""
+    grids = [piece.grid for piece in pieces]
+    able = [i for i, grid in enumerate(grids) if chosen.name == "linear" or int(grid.seen.sum()) >= FEWEST]
+    found, rerun, settings = _chain(grids, able, messages) if chosen.name == "em" else _plain(chosen, grids, able)
+    failed = [i for i in range(len(grids)) if i not in found or not _plausible(found[i], grids[i])]
+    if failed and chosen.name != "linear":
+        messages.append(_failed_words(chosen, [pieces[i] for i in failed], len(pieces)))
+    paths = [_spare(grid, chosen) if i in failed else found[i] for i, grid in enumerate(grids)]
+    good = [i for i in range(len(grids)) if i not in failed]
+    tested: list[calibrate.Tested] = []
+    if lengths.size and good:
+        whole = [grids[i] for i in good]
+        tested = calibrate.tested(
+            whole,
+            lambda which, hidden: rerun([good[k] for k in which], hidden),
+            calibrate.lengths_to_test(whole, lengths),
+            level,
+            NormalDist().inv_cdf(0.5 + level / 2),
+        )
+        messages.extend(_test_words(tested, lengths, level))
+    settings.update({f"inflation at {one.length_s:.3g} s": round(one.inflation, 3) for one in tested})
+    # a variance that rests on a guess may be made smaller by the test, one that a model claims may not
+    claimed = all(path.info.get("claimed", True) for path in paths) and all(grid.has_speed for grid in grids)
+    return _Answers(paths, tested, 1.0 if claimed else 0.0, settings)
+
+
+def _chain(
+    grids: Sequence[Grid], able: Sequence[int], messages: list[str]
+) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
+    """Solve the chain for the pieces that have enough fixes."""
+    fits = dict(zip(able, chain.solve([grids[i] for i in able]), strict=True))
+
+    def rerun(which: Sequence[int], hidden: Sequence[Grid]) -> list[Path]:
+        return [
+            fit.path
+            for fit in chain.solve(
+                hidden,
+                chain.Chain(rounds=_AGAIN),
+                sigma=np.array([fits[i].sigma for i in which]),
+                azimuth=[fits[i].z[:, chain.AZIMUTH] for i in which],
+                learn=False,
+            )
+        ]
+
+    settings: dict[str, object] = {}
+    if fits:
+        weight = [len(grids[i]) for i in fits]
+        sigma = np.sqrt(np.average([fit.sigma**2 for fit in fits.values()], axis=0, weights=weight))
+        settings.update(
+            {f"{name} noise": float(f"{value:.3g}") for name, value in zip(chain.GROUPS, sigma, strict=True)}
+        )
+        for name in ("speed_scale", "yaw_bias", "slow_sd"):
+            value = np.average([fit.path.info[name] for fit in fits.values()], weights=weight)
+            settings[_WORDS[name]] = float(f"{value:.4g}")
+        slow = float(np.average([fit.path.info["slow_sd"] for fit in fits.values()], weights=weight))
+        messages.append(
+            f"the fixes are taken to be wrong by {slow:.2g} m for minutes at a time (1 sigma, learnt from the drive);"
+            " the half-widths have it added"
+        )
+    return {i: fit.path for i, fit in fits.items()}, rerun, settings
+
+
+def _plain(
+    chosen: Method, grids: Sequence[Grid], able: Sequence[int]
+) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
+    """Run a method that learns from the longest piece."""
+    tuned = chosen.tune(grids[max(able, key=lambda i: len(grids[i]))]) if able else {}
+
+    def rerun(which: Sequence[int], hidden: Sequence[Grid]) -> list[Path]:  # noqa: ARG001
+        return [_with_variance(p, g) for p, g in zip(chosen.run(hidden, tuned), hidden, strict=True)]
+
+    settings: dict[str, object] = {f"{_words(name)} noise": float(f"{value:.3g}") for name, value in tuned.items()}
+    return dict(zip(able, rerun(able, [grids[i] for i in able]), strict=True)), rerun, settings
+
+
+def _spare(grid: Grid, chosen: Method) -> Path:
+    """Estimate a piece on which the chosen method failed."""
+    if chosen.name not in ("cv", "linear") and int(grid.seen.sum()) >= FEWEST:
+        cv = METHODS["cv"]
+        path = cv.run([grid], cv.tune(grid))[0]
+        if _plausible(path, grid):
+            return path
+    if grid.seen.any():
+        return METHODS["linear"].run([grid], {})[0]
+    raise BadLog("a part of the log has no fix, at least one position is expected")
+
+
+def _plausible(path: Path, grid: Grid) -> bool:
+    """Whether a path can be shown: it has numbers, keeps near the fixes and does not stray between them.
+
+    The nodes must stay within what a vehicle can reach from the straight line between two fixes: half of the distance
+    that the top speed would take in the pause, and some metres.
+    """
+    if not usable(path):
+        return False
+    seen = np.flatnonzero(grid.seen)
+    t, fixes = grid.t, grid.t[seen]
+    off = np.hypot(*(p - np.interp(t, fixes, q[seen]) for p, q in ((path.east, grid.east), (path.north, grid.north))))
+    after = np.minimum(np.searchsorted(fixes, t), fixes.size - 1)
+    before = np.maximum(np.searchsorted(fixes, t, side="right") - 1, 0)
+    near = np.where(
+        (t < fixes[0]) | (t > fixes[-1]),
+        np.abs(t - fixes[before]) + np.abs(t - fixes[after]),
+        fixes[after] - fixes[before],
+    )
+    reach = _top_speed(grid) * near
+    spread = np.median(off[seen])
+    return bool(np.all(off <= 20.0 + 10.0 * spread + reach))
+
+
+def _top_speed(grid: Grid) -> float:
+    """Return a speed that the vehicle of this log surely did not exceed by much, m/s."""
+    seen = np.flatnonzero(grid.seen)
+    fastest = float(np.abs(grid.speed).max()) if grid.has_speed else 0.0
+    if seen.size > 1:
+        step = np.maximum(np.diff(grid.t[seen]), 1.0)
+        moved = np.hypot(np.diff(grid.east[seen]), np.diff(grid.north[seen]))
+        fastest = max(fastest, float(np.quantile(moved / step, 0.99)))
+    return max(1.5 * fastest, 10.0)
+
+
+def _with_variance(path: Path, grid: Grid) -> Path:
+    """Give a path without a variance the shape of one: it grows with the time to the nearest fix.
+
+    The shape means nothing by itself; hiding fixes gives it its size.
+    """
+    if path.variance is not None:
+        return path
+    fixes = grid.t[grid.seen]
+    k = np.clip(np.searchsorted(fixes, grid.t), 1, max(fixes.size - 1, 1))
+    near = np.minimum(np.abs(grid.t - fixes[k - 1]), np.abs(grid.t - fixes[np.minimum(k, fixes.size - 1)]))
+    sd = 0.3 + 0.5 * near
+    seen = grid.seen
+    off = np.concatenate(((path.east - grid.east)[seen], (path.north - grid.north)[seen]))
+    return replace(
+        path,
+        variance=np.column_stack((sd**2, sd**2)),
+        fix_variance=float(np.mean(off**2)),
+        info={**path.info, "claimed": False},
+    )
+
+
+def _failed_words(chosen: Method, pieces: Sequence[_Piece], n: int) -> str:
+    spans = ", ".join(f"{piece.start:.0f} to {piece.stop:.0f} s" for piece in pieces[:3])
+    more = f" and {len(pieces) - 3} more" if len(pieces) > 3 else ""
+    return (
+        f"`{chosen.name}` found no usable path in {len(pieces)} of {n} parts of the log ({spans}{more}):"
+        " a simpler method filled them"
+    )
+
+
+def _test_words(tested: Sequence[calibrate.Tested], lengths: Floats, level: float) -> list[str]:
+    """Say what hiding fixes showed."""
+    if not tested:
+        return ["too few fixes to test the half-widths on this log: they are the model's own"]
+    words = "; ".join(
+        f"{one.length_s:.3g} s: {100 * one.coverage:.0f} % of hidden fixes inside,"
+        f" widened {max(one.inflation, 1):.2f} times"
+        for one in tested
+    )
+    found = [f"{100 * level:g} % intervals tested on {sum(o.stretches for o in tested)} hidden stretches: {words}"]
+    longest = tested[-1].length_s
+    if lengths.max() > 1.2 * longest:
+        found.append(
+            f"the longest gap lasts {lengths.max():.0f} s but this log can test intervals only up to {longest:.0f} s"
+        )
+    return found
+
+
+# ---- reading the track off the paths -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """What the track needs at its rows."""
+
+    east: Floats
+    north: Floats
+    azimuth: Floats
+    speed: Floats
+    variance: Floats  # (M, 2)
+    fix_variance: Floats  # (M,)
+    slow_variance: Floats  # (M,)
+
+
+def _read(answers: _Answers, pieces: Sequence[_Piece], t: Floats) -> _Columns:
+    """Read each row off the path of its piece."""
+    east, north, azimuth, speed_at = (np.full(t.size, np.nan) for _ in range(4))
+    columns = _Columns(east, north, azimuth, speed_at, np.zeros((t.size, 2)), np.zeros(t.size), np.zeros(t.size))
+    starts = np.array([piece.start for piece in pieces])
+    of = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(pieces) - 1)
+    for i, path in enumerate(answers.paths):
+        rows = of == i
+        if not rows.any():
+            continue
+        at = t[rows]
+        columns.east[rows], columns.north[rows] = _curve(path.t, path.east, at), _curve(path.t, path.north, at)
+        heading, speed = heading_of(path), path.speed
+        known = np.isfinite(heading)
+        if known.any():
+            columns.azimuth[rows] = np.interp(at, path.t[known], np.unwrap(heading[known]))
+        if not np.isfinite(speed).all() and path.t.size > 1:
+            speed = np.hypot(np.gradient(path.east, path.t), np.gradient(path.north, path.t))
+        columns.speed[rows] = np.interp(at, path.t, speed)
+        variance = path.variance if path.variance is not None else np.zeros((path.t.size, 2))
+        for j in (0, 1):
+            columns.variance[rows, j] = np.interp(at, path.t, variance[:, j])
+        columns.fix_variance[rows] = path.fix_variance
+        columns.slow_variance[rows] = path.info.get("slow_sd", 0.0) ** 2
+    return columns
+
+
+def _curve(t: Floats, p: Floats, at: Floats) -> Floats:
+    """Read a path between its nodes by cubic pieces with the nodes' mean slopes; straight lines beyond its ends."""
+    if t.size < 2:
+        return np.full(at.size, p[0])
+    slope = np.gradient(p, t)
+    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, t.size - 2)
+    h = t[k + 1] - t[k]
+    s = np.clip((at - t[k]) / h, 0.0, 1.0)
+    return np.asarray(
+        (1 + 2 * s) * (1 - s) ** 2 * p[k]
+        + s * (1 - s) ** 2 * h * slope[k]
+        + s**2 * (3 - 2 * s) * p[k + 1]
+        - s**2 * (1 - s) * h * slope[k + 1]
+    )
+
+
+def _half_widths(
+    columns: _Columns, answers: _Answers, grid: Grid, away: Floats, length: Floats, z: float, quality: NDArray[np.str_]
+) -> Floats:
+    """Return the half-widths (M, 2), m: the model's, widened as tested, and no wider than a vehicle can go."""
+    factor = np.ones(away.size)
+    empty = quality != "fix"
+    factor[empty] = calibrate.inflation(answers.tested, length[empty], least=answers.least)
+    quick = factor[:, None] ** 2 * (columns.variance + columns.fix_variance[:, None])
+    half = z * np.sqrt(quick + columns.slow_variance[:, None])
+    # twice: both the estimate and the vehicle are within reach of the nearest fix
+    limit = 2 * _top_speed(grid) * away + z * np.sqrt(columns.fix_variance + columns.slow_variance) + 10.0
+    return np.minimum(half, limit[:, None])
+
+
+def _altitude(log: Log, t: Floats) -> Floats:
+    """Interpolate the heights that the log has."""
+    clock, height = log.stream("alt_m")
+    return np.interp(t, clock, height) if clock.size else np.full(t.size, np.nan)

@@ -1,0 +1,230 @@
+"""The common clock of one drive: fixes as nodes, sensors averaged over the steps between them.
+
+Every estimator of this package works on the same `Grid`. Its nodes are the fixes, thinned to at least 0.19 s apart
+(5 Hz), and, where fixes are further apart than the sensors allow, nodes in between. Speed and yaw rate are averaged
+over each step (their integral by the trapezoid rule, divided by the step), after the sensor clock has been moved by
+`clock_offset`. Where a sensor was silent its mean is an interpolation; `speed_sd` and `yaw_rate_sd` say how wrong
+that may be.
+"""
+
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.errors import BadLog, BadValue
+from halfwidth.vehicle.frames import Frame
+from halfwidth.vehicle.log import Log
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Fixes closer together than this are thinned out, s.
+MIN_STEP = 0.19
+
+#: Longest row of nodes put into one pause between fixes; longer pauses get longer steps.
+MAX_NODES = 3000
+
+#: How fast a car changes its mind while a sensor is silent: m/s^2 and rad/s^2, up to m/s and rad/s.
+_DRIFT = {"speed": (1.5, 10.0), "yaw_rate": (0.15, 0.3)}
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """One drive, or a part of it, on one clock.
+
+    Parameters
+    ----------
+    t : (T,) array
+        Time of each node, s, strictly increasing.
+    east, north : (T,) arrays
+        Fixes in metres of `frame`; whatever stands where `seen` is False is not used.
+    seen : (T,) bool array
+        Whether the node has a fix.
+    course : (T,) array
+        Course over ground that the receiver gave at the node, rad; NaN where it gave none.
+    speed, yaw_rate : (T,) arrays
+        Mean over the step that ends in the node, m/s and rad/s; the first repeats the second.
+    speed_sd, yaw_rate_sd : (T,) arrays
+        Standard deviation of those means where the sensor was silent, 0 where it spoke.
+    has_speed, has_yaw_rate : bool
+        Whether the log has the sensor at all; without it the means are 0.
+    frame : Frame
+    """
+
+    t: Floats
+    east: Floats
+    north: Floats
+    seen: Mask
+    course: Floats
+    speed: Floats
+    yaw_rate: Floats
+    speed_sd: Floats
+    yaw_rate_sd: Floats
+    has_speed: bool
+    has_yaw_rate: bool
+    frame: Frame
+
+    def __len__(self) -> int:
+        return int(self.t.size)
+
+    @property
+    def h(self) -> Floats:
+        """(T,) array: the step that ends in each node, s; the first repeats the second."""
+        step = np.diff(self.t)
+        return np.concatenate((step[:1] if step.size else np.ones(1), step))
+
+    def between(self, t0: float, t1: float) -> "Grid":
+        """Return the nodes of ``t0 <= t <= t1``."""
+        return self.rows(slice(int(np.searchsorted(self.t, t0)), int(np.searchsorted(self.t, t1, side="right"))))
+
+    def rows(self, rows: slice) -> "Grid":
+        """Return a stretch of nodes."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _ARRAYS})
+
+    def without(self, t0: float, t1: float) -> "Grid":
+        """Return the grid with fixes and courses of ``t0 <= t <= t1`` hidden."""
+        return self.masked((self.t >= t0) & (self.t <= t1))
+
+    def masked(self, hidden: Mask) -> "Grid":
+        """Return the grid with the fixes and courses of some nodes, (T,), hidden."""
+        return replace(self, seen=self.seen & ~hidden, course=np.where(hidden, np.nan, self.course))
+
+
+_ARRAYS = ("t", "east", "north", "seen", "course", "speed", "yaw_rate", "speed_sd", "yaw_rate_sd")
+
+
+def sampled(log: Log, *, clock_offset: float = 0.0, frame: Frame | None = None) -> Grid:
+    """Put a log on one clock.
+
+    Parameters
+    ----------
+    log : Log
+    clock_offset : float
+        Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes: positive
+        where a fix comes later than the sensors that saw the same moment.
+    frame : Frame, optional
+        Local axes; `Frame.of` the log if absent.
+
+    Returns
+    -------
+    Grid
+
+    Raises
+    ------
+    BadLog
+        If the log has no fix.
+    BadValue
+        If `clock_offset` is not a finite number.
+    """
+    if not np.isfinite(clock_offset):
+        raise BadValue(f"`clock_offset` is {clock_offset!r}, a finite number of seconds is expected", hint="0.0")
+    fixed = np.flatnonzero(log.fixed)
+    if fixed.size == 0:
+        raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
+    frame = Frame.of(log) if frame is None else frame
+    kept = fixed[_thinned(log.t[fixed])]
+    t_fix = log.t[kept]
+    sensors = {name: log.stream(f"{name}{unit}") for name, unit in (("speed", "_mps"), ("yaw_rate", "_radps"))}
+    t = _nodes(log, t_fix, [clock for clock, _ in sensors.values()])
+    at = np.searchsorted(t, t_fix)
+    T = t.size
+    east, north, seen = np.zeros(T), np.zeros(T), np.zeros(T, dtype=bool)
+    east[at], north[at] = frame.to_local(log.lat_deg[kept], log.lon_deg[kept])
+    seen[at] = True
+    mean = {name: _means(t, clock + clock_offset, values, *_DRIFT[name]) for name, (clock, values) in sensors.items()}
+    return Grid(
+        t=t,
+        east=east,
+        north=north,
+        seen=seen,
+        course=_course(log, t, seen),
+        speed=mean["speed"][0],
+        yaw_rate=mean["yaw_rate"][0],
+        speed_sd=mean["speed"][1],
+        yaw_rate_sd=mean["yaw_rate"][1],
+        has_speed=sensors["speed"][0].size > 0,
+        has_yaw_rate=sensors["yaw_rate"][0].size > 0,
+        frame=frame,
+    )
+
+
+def _thinned(t: Floats) -> list[int]:
+    """Return the fixes that are at least MIN_STEP after the one kept before."""
+    times = t.tolist()
+    kept = [0]
+    while True:
+        k = bisect_left(times, times[kept[-1]] + MIN_STEP - 1e-9, kept[-1] + 1)
+        if k >= len(times):
+            return kept
+        kept.append(k)
+
+
+def _nodes(log: Log, t_fix: Floats, clocks: list[Floats]) -> Floats:
+    """Return the fixes and, in longer pauses, nodes as often as the sensors spoke, but not above 5 Hz."""
+    usual = [float(np.median(np.diff(clock))) for clock in (t_fix, *clocks) if clock.size > 1]
+    step = max(0.2, min(usual)) if usual else 1.0
+    marks = np.unique(np.concatenate((log.t[:1], t_fix, log.t[-1:])))
+    pause = np.diff(marks)
+    inside = np.minimum(np.ceil(pause / step * (1 - 1e-6)) - 1, MAX_NODES)
+    inside[pause <= 1.5 * step] = 0
+    n = inside.astype(int)
+    first = np.repeat(marks[:-1], n)
+    k = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n) + 1
+    return np.sort(np.concatenate((marks, first + k * np.repeat(pause / (n + 1), n))))
+
+
+def _means(t: Floats, clock: Floats, values: Floats, rate: float, most: float) -> tuple[Floats, Floats]:
+    """Return the mean of a sensor over each step, and its standard deviation where the sensor was silent."""
+    if clock.size == 0 or t.size < 2:
+        level = float(values.mean()) if clock.size else 0.0
+        return np.full(t.size, level), np.zeros(t.size)
+    if clock.size == 1:
+        clock, values = np.array([clock[0], clock[0] + 1e-3]), np.repeat(values, 2)
+    step = np.diff(clock)
+    area = np.concatenate(([0.0], np.cumsum(step * (values[1:] + values[:-1]) / 2)))
+    k = np.clip(np.searchsorted(clock, t, side="right") - 1, 0, clock.size - 2)
+    into = np.clip(t - clock[k], 0.0, step[k])
+    total = area[k] + into * (values[k] + 0.5 * into * (values[k + 1] - values[k]) / step[k])
+    # beyond its ends the sensor is taken to stay where it was
+    total += np.minimum(t - clock[0], 0.0) * values[0] + np.maximum(t - clock[-1], 0.0) * values[-1]
+    mean = np.diff(total) / np.diff(t)
+    return np.concatenate((mean[:1], mean)), _silence(t, clock, rate, most)
+
+
+def _silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
+    """Return the standard deviation of each step's mean where the sensor was silent for long.
+
+    The steps of one silence err together, while an estimator takes them as independent. So each is given the share of
+    variance that makes the whole silence come out right: sd^2 * (length of the silence) / (length of the step).
+    """
+    step = np.diff(clock)
+    limit = max(3.0 * float(np.median(step)), 0.5)
+    middle = t.copy()
+    middle[1:] -= np.diff(t) / 2
+    k = np.searchsorted(clock, middle)
+    before, after = clock[np.maximum(k - 1, 0)], clock[np.minimum(k, clock.size - 1)]
+    outside = (k == 0) | (k == clock.size)
+    far = np.where(
+        outside, np.abs(middle - np.where(k == 0, after, before)), np.minimum(middle - before, after - middle)
+    )
+    length = np.where(outside, 2 * far, after - before)
+    h = np.concatenate((np.diff(t)[:1], np.diff(t)))
+    sd = np.minimum(rate * far, most) * np.sqrt(np.maximum(length / h, 1.0))
+    return np.where(length > limit, sd, 0.0)
+
+
+def _course(log: Log, t: Floats, seen: Mask) -> Floats:
+    """Return the receiver's course at the nodes with a fix, from at most half a node's distance away."""
+    clock, values = log.stream("azimuth_rad")
+    course = np.full(t.size, np.nan)
+    if clock.size == 0:
+        return course
+    k = np.clip(np.searchsorted(clock, t), 1, max(clock.size - 1, 1))
+    left = np.maximum(k - 1, 0)
+    k = np.minimum(k, clock.size - 1)
+    near = np.where(np.abs(clock[k] - t) < np.abs(t - clock[left]), k, left)
+    close = seen & (np.abs(clock[near] - t) <= 0.06)
+    course[close] = values[near[close]]
+    return course

@@ -1,0 +1,399 @@
+"""The outage benchmark: hide fixes of a log, fill the hole, measure how far off the filling is.
+
+Starts are drawn at random and are the same for every method. Only the fixes (and courses) inside the outage are hidden;
+speed and yaw rate stay. A start counts only if the vehicle averages more than 1 m/s in the outage, since standing still
+is no test. The error is the distance to each hidden fix. A cell of the table is the mean over all hidden fixes and the
+mean over starts of the largest error of each outage. `coverage` is the share of hidden fixes, east and north counted
+apart, inside the interval at `level` of a method that claims one.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import NormalDist
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.errors import BadLog, BadValue
+from halfwidth.vehicle.estimators import METHODS, Method, method, usable
+from halfwidth.vehicle.grid import Grid, sampled
+from halfwidth.vehicle.log import Log, to_frame
+from halfwidth.vehicle.path import Path
+
+Floats = NDArray[np.float64]
+
+#: Lengths of the outages of the full benchmark, s.
+LENGTHS: tuple[float, ...] = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
+
+#: Fixes that must be left before and after an outage, s.
+MARGIN = 20.0
+
+#: The vehicle must average more than this in an outage, m/s.
+MIN_SPEED = 1.0
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """Errors of one method at one length of outage.
+
+    Parameters
+    ----------
+    method : str
+    length : float
+        Length of the outages, s.
+    start : (n,) array
+        Time at which each outage begins, s.
+    mean_error, max_error : (n,) arrays
+        Mean and largest distance to the hidden fixes of each outage, m.
+    n_fixes : (n,) int array
+        Hidden fixes of each outage.
+    inside : (n,) array or None
+        Share of them inside the interval, each axis by itself; None where the method claims no interval.
+    failed : int
+        Outages in which the method found no usable path; there the straight line was counted instead.
+    seconds : float
+        Time the method took for all outages, s.
+    """
+
+    method: str
+    length: float
+    start: Floats
+    mean_error: Floats = field(repr=False)
+    max_error: Floats = field(repr=False)
+    n_fixes: NDArray[np.int64] = field(repr=False)
+    inside: Floats | None = field(repr=False)
+    failed: int
+    seconds: float
+
+    @property
+    def n(self) -> int:
+        """Number of outages."""
+        return int(self.start.size)
+
+    @property
+    def mean(self) -> float:
+        """Mean error over all hidden fixes, m."""
+        return float(np.average(self.mean_error, weights=self.n_fixes))
+
+    @property
+    def max(self) -> float:
+        """Mean over the outages of the largest error, m."""
+        return float(self.max_error.mean())
+
+    @property
+    def worst(self) -> float:
+        """Largest error of all, m."""
+        return float(self.max_error.max())
+
+    @property
+    def mean_se(self) -> float:
+        """Standard error of `mean` over the starts, m; NaN with one start."""
+        return _standard_error(self.mean_error)
+
+    @property
+    def max_se(self) -> float:
+        """Standard error of `max` over the starts, m; NaN with one start."""
+        return _standard_error(self.max_error)
+
+    @property
+    def coverage(self) -> float | None:
+        """Share of hidden fixes inside the interval; None where the method claims no interval."""
+        return None if self.inside is None else float(np.average(self.inside, weights=self.n_fixes))
+
+
+@dataclass(frozen=True, eq=False)
+class Outages:
+    """What the benchmark found; prints as a table.
+
+    Parameters
+    ----------
+    source : str
+        Where the log came from.
+    cells : tuple of Cell
+        Method by method, length by length.
+    level : float
+        Level of the intervals.
+    seed : int
+    clock_offset : float
+        Seconds added to the time stamps of speed and yaw rate.
+    skipped : mapping of str to str
+        Methods and lengths that could not be tried, and why.
+    """
+
+    source: str
+    cells: tuple[Cell, ...]
+    level: float
+    seed: int
+    clock_offset: float
+    skipped: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the methods, in the order of the table."""
+        return tuple(dict.fromkeys(cell.method for cell in self.cells))
+
+    @property
+    def lengths(self) -> tuple[float, ...]:
+        """Lengths of the outages, s."""
+        return tuple(sorted({cell.length for cell in self.cells}))
+
+    def cell(self, method: str, length: float) -> Cell:
+        """Return the cell of one method and length.
+
+        Raises
+        ------
+        BadValue
+            If it was not tried.
+        """
+        for cell in self.cells:
+            if cell.method == method and cell.length == length:
+                return cell
+        raise BadValue(f"`{method}` at {length:g} s is not in the table, one of {', '.join(self.methods)} is expected")
+
+    def frame(self, native: str = "pandas") -> Any:
+        """Return the table as a data frame, one row a cell.
+
+        Parameters
+        ----------
+        native : {"pandas", "polars", "pyarrow"}
+
+        Returns
+        -------
+        DataFrame or Table
+            ``method, length_s, starts, mean_m, mean_se_m, max_m, max_se_m, worst_m, coverage, failed, seconds``.
+        """
+        return to_frame({name: np.array(values) for name, values in self._columns().items()}, native)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the table as plain data, one mapping a cell; None where a number is not known."""
+        columns = self._columns()
+        return [{name: _plain(values[k]) for name, values in columns.items()} for k in range(len(self.cells))]
+
+    def _columns(self) -> dict[str, list[Any]]:
+        cells = self.cells
+        return {
+            "method": [c.method for c in cells],
+            "length_s": [c.length for c in cells],
+            "starts": [c.n for c in cells],
+            "mean_m": [c.mean for c in cells],
+            "mean_se_m": [c.mean_se for c in cells],
+            "max_m": [c.max for c in cells],
+            "max_se_m": [c.max_se for c in cells],
+            "worst_m": [c.worst for c in cells],
+            "coverage": [np.nan if c.coverage is None else c.coverage for c in cells],
+            "failed": [c.failed for c in cells],
+            "seconds": [c.seconds for c in cells],
+        }
+
+    def table(self) -> str:
+        """Return the table as text: mean / mean of maxima in metres, then coverage."""
+        if not self.cells:
+            return "\n".join(["no outage could be tried", *self._notes()])
+        lengths, name = self.lengths, max(len(m) for m in (*self.methods, "coverage"))
+        head = f"{'':{name}}" + "".join(f"{f'{length:g} s':>16}" for length in lengths)
+        starts = [max(c.n for c in self.cells if c.length == length) for length in lengths]
+        lines = [
+            f"outages of {self.source or 'the log'}: metres, mean / mean of maxima",
+            head,
+            f"{'starts':{name}}" + "".join(f"{n:>16}" for n in starts),
+        ]
+        for m in self.methods:
+            row = [self._found(m, length) for length in lengths]
+            lines.append(f"{m:{name}}" + "".join(f"{_pair(c):>16}" for c in row))
+        covered = [c for c in self.cells if c.coverage is not None]
+        if covered:
+            lines += ["", f"share of hidden fixes inside the {100 * self.level:g} % interval", head]
+            for m in dict.fromkeys(c.method for c in covered):
+                row = [self._found(m, length) for length in lengths]
+                shares = ["" if c is None or c.coverage is None else f"{c.coverage:.2f}" for c in row]
+                lines.append(f"{m:{name}}" + "".join(f"{s:>16}" for s in shares))
+        return "\n".join([*lines, *self._notes()])
+
+    def _found(self, name: str, length: float) -> Cell | None:
+        return next((c for c in self.cells if c.method == name and c.length == length), None)
+
+    def _notes(self) -> list[str]:
+        errors = [c.mean_se / c.mean for c in self.cells if c.n > 1 and c.mean > 0]
+        notes = [f"{what}: {why}" for what, why in self.skipped.items()]
+        notes += [
+            f"{c.method} at {c.length:g} s found no path in {c.failed} of {c.n} outages: straight line counted"
+            for c in self.cells
+            if c.failed
+        ]
+        if errors:
+            notes.append(
+                f"standard error of a mean: {100 * float(np.median(errors)):.0f} % of it (median of the cells)"
+            )
+        return ["", *notes] if notes else []
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything but the single errors as plain data, for JSON."""
+        return {
+            "level": self.level,
+            "seed": self.seed,
+            "clock_offset": self.clock_offset,
+            "skipped": dict(self.skipped),
+            "cells": self.rows(),
+        }
+
+    def summary(self) -> str:
+        """Return the table as text."""
+        return self.table()
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def __repr__(self) -> str:
+        return self.table()
+
+
+def outages(
+    log: Any,
+    lengths: Sequence[float] = LENGTHS,
+    starts: int = 20,
+    seed: int = 1,
+    methods: Sequence[str] | None = None,
+    *,
+    clock_offset: float | None = None,
+    level: float = 0.9,
+    progress: Progress | None = None,
+) -> Outages:
+    """Hide fixes of a log at random places and measure how well each method fills the hole.
+
+    Parameters
+    ----------
+    log : Log, path or frame
+        As for `fill`.
+    lengths : sequence of float
+        Lengths of the outages, s.
+    starts : int
+        Outages of each length.
+    seed : int
+        Seed of the starts; the same seed gives the same starts, whatever the methods.
+    methods : sequence of str, optional
+        Names of estimators; all that the log's sensors allow if absent.
+    clock_offset : float, optional
+        Seconds to add to the time stamps of speed and yaw rate, see `sampled`; 0 if absent.
+    level : float
+        Level of the intervals whose coverage is counted.
+    progress : function (share, words), optional
+        Called with the share done, 0 to 1, and what is being done.
+
+    Returns
+    -------
+    Outages
+
+    Raises
+    ------
+    BadValue
+        If a length is not positive, `starts` is not a positive whole number, or a method has no such name.
+    BadLog
+        If the log has fewer than three fixes.
+    """
+    from halfwidth.vehicle.fill import as_log
+
+    given = tuple(float(length) for length in lengths)
+    if not given or not all(np.isfinite(length) and length > 0 for length in given):
+        raise BadValue(f"`lengths` is {lengths!r}, positive numbers of seconds are expected", hint="lengths=(1, 5, 30)")
+    if not isinstance(starts, int) or starts < 1:
+        raise BadValue(f"`starts` is {starts!r}, a whole number from 1 is expected", hint="starts=20")
+    if not 0 < level < 1:
+        raise BadValue(f"`level` is {level!r}, a probability between 0 and 1 is expected", hint="0.9")
+    drive_log: Log = as_log(log)[0]
+    chosen = [method(name) for name in (METHODS if methods is None else methods)]
+    offset = 0.0 if clock_offset is None else float(clock_offset)
+    drive = sampled(drive_log, clock_offset=offset)
+    if int(drive.seen.sum()) < 3:
+        raise BadLog(f"the log has {int(drive.seen.sum())} fixes, at least 3 are expected to hide some")
+    skipped = {m.name: f"the log has no {lack}" for m in chosen if (lack := m.lacks(drive))}
+    usable_methods = [m for m in chosen if m.name not in skipped]
+    places = {length: _starts(drive, length, starts, seed) for length in given}
+    for length in given:
+        if places[length].size == 0:
+            skipped[f"{length:g} s"] = "no place in the log has fixes on both sides and a moving vehicle"
+        elif places[length].size < starts:
+            skipped[f"{length:g} s"] = f"only {places[length].size} of {starts} starts found a place"
+    tried = [length for length in given if places[length].size]
+    total = len(usable_methods) * len(tried)
+    cells: list[Cell] = []
+    for m in usable_methods:
+        tuned = m.tune(drive) if tried else {}
+        for length in tried:
+            if progress is not None:
+                progress(len(cells) / total, f"{m.name}, {length:g} s")
+            cells.append(_cell(drive, m, tuned, length, places[length], level))
+    if progress is not None:
+        progress(1.0, "done")
+    return Outages(drive_log.source, tuple(cells), level, seed, offset, MappingProxyType(skipped))
+
+
+def _starts(drive: Grid, length: float, n: int, seed: int) -> Floats:
+    """Draw the beginnings of n outages: fixes on both sides, moving inside, the same for every method."""
+    rng = np.random.default_rng([seed, round(1000 * length)])
+    t = drive.t[drive.seen]
+    lo, hi = t[0] + MARGIN, t[-1] - MARGIN - length
+    if hi <= lo:
+        return np.empty(0)
+    moved = np.concatenate(([0.0], np.cumsum(_pace(drive)[1:] * np.diff(drive.t))))
+    begin = rng.uniform(lo, hi, 50 * n)
+    end = begin + length
+    pace = (np.interp(end, drive.t, moved) - np.interp(begin, drive.t, moved)) / length
+    hidden = np.searchsorted(t, end, side="right") - np.searchsorted(t, begin)
+    before = np.searchsorted(t, begin) - np.searchsorted(t, begin - MARGIN)
+    after = np.searchsorted(t, end + MARGIN, side="right") - np.searchsorted(t, end, side="right")
+    good = (pace > MIN_SPEED) & (hidden > 0) & (before > 1) & (after > 1)
+    return begin[good][:n]
+
+
+def _pace(drive: Grid) -> Floats:
+    """Return the speed over each step: the sensor's, or that of the fixes."""
+    if drive.has_speed:
+        return np.abs(drive.speed)
+    seen = np.flatnonzero(drive.seen)
+    east, north = (np.interp(drive.t, drive.t[seen], p[seen]) for p in (drive.east, drive.north))
+    step = np.hypot(np.diff(east), np.diff(north)) / np.diff(drive.t)
+    return np.concatenate((step[:1], step))
+
+
+def _cell(drive: Grid, m: Method, tuned: Mapping[str, float], length: float, begin: Floats, level: float) -> Cell:
+    from time import perf_counter
+
+    whole = [drive.between(t0 - m.context, t0 + length + m.context) for t0 in begin]
+    hidden = [part.without(t0, t0 + length) for part, t0 in zip(whole, begin, strict=True)]
+    clock = perf_counter()
+    paths = m.run(hidden, tuned)
+    seconds = perf_counter() - clock
+    z = NormalDist().inv_cdf(0.5 + level / 2)
+    means, largest, counts, inside, failed = [], [], [], [], 0
+    for full, part, found in zip(whole, hidden, paths, strict=True):
+        path: Path = found
+        if not usable(path):
+            failed += 1
+            path = METHODS["linear"].run([part], {})[0]
+        out = full.seen & ~part.seen
+        error = np.column_stack((path.east - full.east, path.north - full.north))[out]
+        distance = np.hypot(error[:, 0], error[:, 1])
+        means.append(distance.mean())
+        largest.append(distance.max())
+        counts.append(distance.size)
+        if path.variance is not None:
+            half = z * np.sqrt(path.variance[out] + path.fix_variance)
+            inside.append(float(np.mean(np.abs(error) <= half)))
+    claimed = np.array(inside) if len(inside) == len(begin) else None
+    return Cell(m.name, length, begin, np.array(means), np.array(largest), np.array(counts), claimed, failed, seconds)
+
+
+def _standard_error(values: Floats) -> float:
+    return float(values.std(ddof=1) / np.sqrt(values.size)) if values.size > 1 else float("nan")
+
+
+def _pair(cell: Cell | None) -> str:
+    return "" if cell is None else f"{cell.mean:.2f} / {cell.max:.2f}"
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,435 @@
+"""The command line keeps its word: where data and words go, exit codes, and what is never overwritten."""
+
+import contextlib
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.vehicle.drives import drive, save
+
+import halfwidth as hw
+from halfwidth.shells import cli, commands
+
+GOOD, INTERNAL, USAGE, BAD, NO_ESTIMATE, LIMIT = 0, 1, 2, 3, 4, 6
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A minute of driving at 5 Hz with a tunnel of eight seconds."""
+    columns = drive(300, dt=0.2)
+    dark = (columns["t_s"] > 20) & (columns["t_s"] < 28)
+    for name in ("lat_deg", "lon_deg", "alt_m", "azimuth_rad"):
+        columns[name] = np.where(dark, np.nan, columns[name])
+    return save(tmp_path / "log.csv", columns)
+
+
+def process(*args, **how):
+    return subprocess.Popen([sys.executable, "-m", "halfwidth", *args], **how)
+
+
+def done(*args, **how):
+    return subprocess.run([sys.executable, "-m", "halfwidth", *args], capture_output=True, check=False, **how)
+
+
+# --- help ---------------------------------------------------------------------------------------
+
+
+def test_help_names_every_command_and_the_exit_codes(capsys):
+    assert cli.run(["--help"]) == GOOD
+    out, err = capsys.readouterr()
+    for name in ("fill", "check", "outages", "demo", "estimate", "doctor", "--version", "Exit codes: 0 good"):
+        assert name in out
+    assert err == ""
+
+
+@pytest.mark.parametrize(
+    ("command", "flags"),
+    [
+        ("fill", "--output -o --report --method --level --clock-offset --json --dry-run --force --quiet --verbose "
+                 "-v --no-progress --columns --format"),
+        ("check", "--json --columns"),
+        ("outages", "--lengths --starts --seed --methods --clock-offset --json --columns"),
+        ("demo", "--output --seed --json --force"),
+        ("estimate", "--output --method --level --seed --json --force"),
+        ("doctor", "--json"),
+    ],
+)  # fmt: skip
+def test_help_of_each_command(command, flags, capsys, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert cli.run([command, "--help"]) == GOOD
+    out = capsys.readouterr().out
+    for flag in flags.split():
+        assert flag in out
+    assert "\x1b" not in out
+
+
+def test_version(capsys):
+    assert cli.run(["--version"]) == GOOD
+    assert capsys.readouterr().out == f"halfwidth {hw.__version__}\n"
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys\nfrom halfwidth.shells.cli import run\nrun(['--help'])\n"
+        "print([m for m in ('numpy', 'scipy', 'pandas', 'pyarrow', 'rich', 'narwhals') if m in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.splitlines()[-1] == "[]"
+
+
+def test_completion():
+    env = os.environ | {"_HALFWIDTH_COMPLETE": "complete_bash", "COMP_WORDS": "halfwidth ch", "COMP_CWORD": "1"}
+    assert done(env=env).stdout.split() == [b"check"]
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        ([], ""),
+        (["chekc"], "Did you mean 'check'?"),
+        (["check"], "LOG"),
+        (["check", "--jsn", "x"], "--json"),
+        (["outages", "x", "--starts", "0"], "--starts"),
+        (["outages", "x", "--lengths", "one"], "`--lengths` is 'one', positive numbers"),
+        (["outages", "x", "--lengths", "1,-2"], "positive numbers"),
+        (["outages", "x", "--methods", "nope"], "there is no method 'nope', one of"),
+        (["fill", "x"], "hint: -o OUT, or -o - for standard output"),
+        (["fill", "x", "-o", "out.csv", "--level", "2"], "`--level` is 2, a probability"),
+        (["fill", "x", "-o", "out.csv", "--level", "nan"], "a probability"),
+        (["fill", "x", "-o", "out.csv", "--clock-offset", "inf"], "finite number of seconds"),
+        (["fill", "x", "-o", "out.csv", "--method", "linaer"], "hint: linear"),
+        (["fill", "x", "-o", "out.doc"], ".gpx"),
+        (["fill", "x", "-o", "-", "--format", "doc"], ".gpx"),
+        (["fill", "x", "-o", "-", "--json"], "both claim standard output"),
+        (["fill", "x", "-o", "-", "--report", "-"], "both claim standard output"),
+        (["fill", "x", "-o", "no/such/folder/out.csv"], "hint: mkdir -p no/such/folder"),
+        (["estimate", "m.toml", "x", "-o", "out.gpx"], ".csv, .csv.gz or .parquet is expected"),
+        (["estimate", "m.toml", "x", "--level", "0"], "a probability"),
+    ],
+)
+def test_usage(args, words, capsys):
+    assert cli.run(args) == USAGE
+    out, err = capsys.readouterr()
+    assert words in err
+    assert out == "" or not args
+
+
+def test_without_typer_it_says_how_to_get_it():
+    code = "import sys; sys.modules['typer'] = None; from halfwidth.shells.cli import main; main(['--help'])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert found.returncode == USAGE
+    assert "pip install 'halfwidth[app]'" in found.stderr
+
+
+# --- fill ---------------------------------------------------------------------------------------
+
+
+def test_fill_writes_a_track_and_a_report_and_words_to_standard_error(log, tmp_path, capfd):
+    out, page = tmp_path / "out.csv", tmp_path / "out.html"
+    assert cli.run(["fill", log, "-o", str(out), "--report", str(page)]) == GOOD
+    data, words = capfd.readouterr()
+    assert data == ""
+    assert f"wrote {out}" in words
+    with open(out) as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 300
+    assert {row["quality"] for row in rows} == {"fix", "bridged"}
+    assert "</html>" in page.read_text()
+    assert "halfwidth " in page.read_text()
+
+
+def test_fill_to_standard_output_is_the_same_as_to_a_file(log, tmp_path, capfdbinary):
+    assert cli.run(["fill", log, "-o", str(tmp_path / "out.csv"), "--quiet"]) == GOOD
+    assert capfdbinary.readouterr() == (b"", b"")
+    assert cli.run(["fill", log, "-o", "-", "--quiet"]) == GOOD
+    out, err = capfdbinary.readouterr()
+    assert out == (tmp_path / "out.csv").read_bytes()
+    assert err == b""
+
+
+def test_fill_from_standard_input(log, tmp_path):
+    with open(log, "rb") as file:
+        found = done("fill", "-", "-o", "-", "--format", "geojson", stdin=file)
+    assert found.returncode == GOOD, found.stderr
+    assert json.loads(found.stdout)["type"] == "FeatureCollection"
+
+
+def test_fill_as_json(log, tmp_path, capsys):
+    out = tmp_path / "out.gpx"
+    assert cli.run(["fill", log, "-o", str(out), "--json", "--method", "linear", "--level", "0.5"]) == GOOD
+    data = json.loads(capsys.readouterr().out)
+    assert data["schema_version"] == 1
+    assert data["method"] == "linear"
+    assert data["level"] == 0.5
+    assert data["rows"]["bridged"] > 30
+    assert data["gaps"][0]["stop"] == pytest.approx(28, abs=0.3)
+    assert data["written"] == {"track": str(out), "report": None}
+    assert out.exists()
+
+
+def test_columns_can_be_named(log, tmp_path, capsys):
+    text = Path(log).read_text().replace("lat_deg", "a").replace("lon_deg", "b")
+    (tmp_path / "odd.csv").write_text(text)
+    assert cli.run(["fill", str(tmp_path / "odd.csv"), "--json", "--columns", "lat=a,lon=b", "-q"]) == GOOD
+    assert json.loads(capsys.readouterr().out)["log"]["fixes"] > 200
+    assert cli.run(["fill", str(tmp_path / "odd.csv"), "--json", "--columns", "lat"]) == BAD
+
+
+def test_repairs_are_told(log, tmp_path, capsys):
+    columns = drive(300, dt=0.2)
+    columns["speed_mps"] = columns["speed_mps"] * 3.6
+    path = save(tmp_path / "kmh.csv", columns)
+    assert cli.run(["fill", path, "-o", str(tmp_path / "out.csv")]) == GOOD
+    assert "note: speed is in km/h" in capsys.readouterr().err
+
+
+def test_a_dry_run_writes_nothing(log, tmp_path, capsys):
+    assert cli.run(["fill", log, "-o", str(tmp_path / "out.csv"), "--dry-run", "--json"]) == GOOD
+    data = json.loads(capsys.readouterr().out)
+    assert data["would_write"] == [str(tmp_path / "out.csv")]
+    assert not (tmp_path / "out.csv").exists()
+
+
+# --- what is never overwritten ------------------------------------------------------------------
+
+
+def test_an_existing_file_is_kept_unless_forced(log, tmp_path, capsys):
+    out = tmp_path / "out.csv"
+    out.write_text("old")
+    assert cli.run(["fill", log, "-o", str(out)]) == USAGE
+    assert "exists already\nhint: --force overwrites it" in capsys.readouterr().err
+    assert out.read_text() == "old"
+    assert cli.run(["fill", log, "-o", str(tmp_path / "new.csv"), "--report", str(out)]) == USAGE
+    assert not (tmp_path / "new.csv").exists()
+    assert cli.run(["fill", log, "-o", str(out), "--force"]) == GOOD
+    assert out.read_text().startswith("t_s,")
+
+
+def test_the_input_is_never_overwritten(log, tmp_path, capsys):
+    before = Path(log).read_text()
+    (tmp_path / "link.csv").symlink_to(log)
+    for name in (log, str(tmp_path / "link.csv")):
+        assert cli.run(["fill", log, "-o", name, "--force"]) == USAGE
+        assert "is the input itself" in capsys.readouterr().err
+    assert Path(log).read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("", "is a directory"),
+        ("log.csv/out.csv", "is no folder"),
+        ("nowhere/out.csv", "is no folder"),
+        ("x" * 300 + ".csv", "file name too long"),
+    ],
+)
+def test_a_place_that_cannot_be_written(name, words, log, tmp_path, capsys):
+    assert cli.run(["fill", log, "-o", str(tmp_path / name) if name else str(tmp_path)]) == USAGE
+    assert words in capsys.readouterr().err
+
+
+def test_a_folder_that_takes_no_files(log, capsys):
+    assert cli.run(["fill", log, "-o", "/proc/out.csv"]) == USAGE
+    assert "`/proc/out.csv` cannot be written" in capsys.readouterr().err
+
+
+# --- a full disk, a reader that leaves, signals ---------------------------------------------------
+
+
+FULL = """
+import resource, sys
+from halfwidth.shells.cli import run
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+sys.exit(run(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("name", ["out.csv", "out.gpx", "out.parquet"])
+def test_a_full_disk_leaves_the_old_file(name, log, tmp_path):
+    out = tmp_path / name
+    out.write_text("old")
+    found = subprocess.run(
+        [sys.executable, "-c", FULL, "fill", log, "-o", str(out), "--force"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert found.returncode == LIMIT, found.stderr
+    assert f"`{out}` cannot be written: file too large; what was there before is still there" in found.stderr
+    assert out.read_text() == "old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["log.csv", name])
+
+
+@pytest.mark.parametrize("args", [["check"], ["check", "--json"], ["fill", "-o", "-"], ["fill", "--json"]])
+def test_a_standard_output_that_is_full(args, log):
+    with open("/dev/full", "wb") as full:
+        found = subprocess.run(
+            [sys.executable, "-m", "halfwidth", args[0], log, *args[1:]],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+    assert found.returncode == LIMIT
+    assert b"no space left on device" in found.stderr
+    assert b"Traceback" not in found.stderr
+    assert b"Exception ignored" not in found.stderr
+
+
+def test_a_device_that_is_full(log, capsys):
+    assert cli.run(["fill", log, "-o", "/dev/full", "--format", "csv", "--force"]) == LIMIT
+    assert "`/dev/full` cannot be written: no space left on device" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("args", [["check"], ["fill", "-o", "-", "-q"]])
+def test_a_reader_that_leaves_is_no_failure(args, log):
+    running = process(args[0], log, *args[1:], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    running.stdout.close()
+    err = running.stderr.read()
+    running.stderr.close()
+    assert running.wait() == GOOD
+    assert b"Traceback" not in err
+    assert b"Broken" not in err
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals(number, code):
+    running = process("check", "-", stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    # more than a pipe holds: once it is written, the program is reading
+    running.stdin.write(b"t_s,lat_deg,lon_deg\n" + b"0,1,1\n" * 50_000)
+    running.stdin.flush()
+    running.send_signal(number)
+    out, err = running.communicate()
+    assert running.returncode == code
+    assert out == b""
+    assert b"Traceback" not in err
+
+
+# --- internal errors ----------------------------------------------------------------------------
+
+
+def test_an_internal_error_is_one_line_and_a_hint(log, monkeypatch, capsys):
+    def broken(*_args, **_how):
+        raise ZeroDivisionError("not our day")
+
+    monkeypatch.setattr("halfwidth.job.run", broken)
+    assert cli.run(["fill", log, "--json"]) == INTERNAL
+    err = capsys.readouterr().err
+    assert err == "internal error: ZeroDivisionError: not our day\nhint: -v shows where, please report it\n"
+    assert cli.run(["fill", log, "--json", "-v"]) == INTERNAL
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (hw.Unsolved("Status.INFEASIBLE: no trajectory fits the bounds"), NO_ESTIMATE),
+        (hw.Refused("this method cannot"), USAGE),
+        (hw.Missing("not installed"), USAGE),
+        (hw.LogTooBig("too big"), LIMIT),
+        (hw.BadRecord("bad"), BAD),
+        (MemoryError(), LIMIT),
+        (KeyboardInterrupt(), 130),
+    ],
+)
+def test_exit_codes_of_errors(error, code, log, monkeypatch, capsys):
+    def broken(_job):
+        raise error
+
+    monkeypatch.setattr("halfwidth.job.run", broken)
+    assert cli.run(["fill", log, "--json"]) == code
+    assert "Traceback" not in capsys.readouterr().err
+
+
+# --- check, outages, demo, doctor ----------------------------------------------------------------
+
+
+def test_check_speaks_to_standard_output(log, capsys):
+    assert cli.run(["check", log]) == GOOD
+    out, err = capsys.readouterr()
+    assert out.startswith(f"{log}: ")
+    assert err == ""
+    assert cli.run(["check", log, "--json"]) == GOOD
+    data = json.loads(capsys.readouterr().out)
+    assert (data["schema_version"], data["command"]) == (1, "check")
+
+
+def test_check_word_for_word(tmp_path, capsys, monkeypatch):
+    columns = drive(600)
+    columns["speed_mps"] = np.round(columns["speed_mps"] * 3.6)
+    save(tmp_path / "log.csv", columns)
+    monkeypatch.chdir(tmp_path)
+    assert cli.run(["check", "log.csv"]) == GOOD
+    assert capsys.readouterr().out == (Path(__file__).parent / "golden" / "check.txt").read_text()
+
+
+def test_outages(log, capsys):
+    args = ["outages", log, "--lengths", "1,2", "--starts", "2", "--methods", "linear,em"]
+    assert cli.run(args) == GOOD
+    out, err = capsys.readouterr()
+    assert "linear" in out
+    assert err == ""
+    assert cli.run([*args, "--json"]) == GOOD
+    data = json.loads(capsys.readouterr().out)
+    assert data["schema_version"] == 1
+    assert {cell["method"] for cell in data["cells"]} == {"linear", "em"}
+
+
+def test_demo(tmp_path, capsys):
+    folder = tmp_path / "demo"
+    assert cli.run(["demo", "-o", str(folder), "--json"]) == GOOD
+    data = json.loads(capsys.readouterr().out)
+    assert len(data["tunnels"]) == 3
+    assert os.path.exists(data["report"])
+    assert cli.run(["demo", "-o", str(folder)]) == USAGE
+    assert "holds files already" in capsys.readouterr().err
+
+
+def test_doctor(capsys):
+    assert cli.run(["doctor", "--json"]) == GOOD
+    data = json.loads(capsys.readouterr().out)
+    assert data["self_test"] == {"core": "good", "highs": "good", "piqp": "good"}
+    assert data["core"]["instructions"] in ("avx2", "base")
+    assert cli.run(["doctor"]) == GOOD
+    assert capsys.readouterr().out.startswith(f"halfwidth {hw.__version__}: all good\n")
+
+
+def test_progress_shows_on_a_terminal_only(monkeypatch):
+    shown = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", shown)
+    with commands._working("filling", quiet=False) as progress:
+        assert progress is None
+    shown.isatty = lambda: True
+    with commands._working("filling", quiet=True) as progress:
+        assert progress is None
+    assert shown.getvalue() == ""
+    monkeypatch.setenv("TERM", "xterm")
+    with commands._working("filling", quiet=False) as progress:
+        progress(3, 12)
+        deadline = time.monotonic() + 5
+        while "3/12" not in shown.getvalue() and time.monotonic() < deadline:
+            time.sleep(0.05)
+    assert "\rfilling 3/12, " in shown.getvalue()
+    # what was shown is wiped away
+    assert shown.getvalue().endswith("\r")
+
+
+def test_a_file_name_cannot_steer_the_terminal(tmp_path, capsys):
+    path = save(tmp_path / "a\x1b[31m.csv", drive(100))
+    assert cli.run(["check", path]) == GOOD
+    assert "\x1b" not in capsys.readouterr().out
+
+
+def test_closed_standard_error_is_no_failure(log):
+    with contextlib.suppress(FileNotFoundError):
+        found = subprocess.run(
+            [sys.executable, "-m", "halfwidth", "check", log], stdout=subprocess.PIPE, check=False,
+            preexec_fn=lambda: os.close(2),
+        )  # fmt: skip
+        assert found.returncode == GOOD
+        assert found.stdout

@@ -1,0 +1,137 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from tests.naive_vehicle import chain_round
+from tests.vehicle.known import known
+
+from halfwidth.result import Status
+from halfwidth.vehicle import chain
+from halfwidth.vehicle.grid import sampled
+
+
+def noisy(**change):
+    return known(**({"noise": 0.2, "speed_noise": 0.1, "yaw_noise": 0.01, "offset": 0.5} | change))
+
+
+def test_one_round_is_dense_least_squares_over_the_rows_of_the_table():
+    drive = sampled(noisy(duration=5.0, scale=1.02, bias=0.01).log).without(2.0, 3.0)
+    psi = chain.azimuth_of(drive)
+    for sigma in (np.array([0.1, 0.05, 0.01, 0.3, 0.3]), np.array([0.02, 0.2, 0.05, 0.1, 1.0])):
+        z, P, _ = chain_round(
+            drive.t, drive.east, drive.north, drive.seen, drive.speed, drive.yaw_rate, psi, sigma, far=100.0
+        )
+        fit = chain.solve([drive], chain.Chain(rounds=1), sigma=sigma)[0]
+        np.testing.assert_allclose(fit.z, z, atol=2e-6)
+        T = len(drive)
+        blocks = P.reshape(T, 7, T, 7)[range(T), :, range(T)]
+        np.testing.assert_allclose(fit.P, blocks, atol=1e-6 * np.abs(blocks).max(axis=0).max(), rtol=1e-4)
+
+
+def test_scales_are_means_of_posterior_squares():
+    drive = sampled(noisy(duration=5.0).log).without(2.0, 3.0)
+    sigma = np.array([0.1, 0.05, 0.01, 0.3, 0.3])
+    *_, new = chain_round(
+        drive.t, drive.east, drive.north, drive.seen, drive.speed, drive.yaw_rate, chain.azimuth_of(drive), sigma
+    )
+    fit = chain.solve([drive], chain.Chain(rounds=2), sigma=sigma)[0]
+    # groups of both axes count one pseudo-row for two residuals
+    np.testing.assert_allclose(fit.sigma, new, rtol=2e-3)
+
+
+def test_learning_raises_the_likelihood():
+    drive = sampled(noisy(duration=100.0).log).without(40.0, 60.0)
+    loglik = [chain.solve([drive], chain.Chain(rounds=n))[0].loglik for n in (1, 3, 8, 24)]
+    assert np.all(np.diff(loglik) > 0)
+
+
+def test_perfect_data_give_the_path_back():
+    made = known(120.0, rate=10.0)
+    drive = sampled(made.log)
+    hidden = drive.without(40.0, 70.0)
+    path = chain.solve([hidden])[0].path
+    assert path.status is Status.OK
+    off = np.hypot(path.east - drive.east, path.north - drive.north)
+    assert off.max() < 0.05
+    at = np.searchsorted(made.t, drive.t)
+    np.testing.assert_allclose(np.cos(path.azimuth - made.azimuth[at]), 1.0, atol=1e-4)
+    np.testing.assert_allclose(path.speed, made.speed[at], atol=0.1)
+
+
+def test_it_finds_speed_scale_and_yaw_bias():
+    fit = chain.solve([sampled(known(200.0, noise=0.05, scale=1.03, bias=0.008).log)])[0]
+    assert fit.path.info["speed_scale"] == pytest.approx(1.03, abs=2e-3)
+    assert fit.path.info["yaw_bias"] == pytest.approx(0.008, abs=5e-4)
+
+
+def test_side_by_side_is_one_by_one():
+    whole = sampled(noisy(duration=150.0).log)
+    drives = [whole.between(0, 60).without(20, 30), whole.between(30, 150).without(80, 110), whole.between(100, 140)]
+    together = chain.solve(drives)
+    for drive, fit in zip(drives, together, strict=True):
+        alone = chain.solve([drive])[0]
+        np.testing.assert_allclose(fit.z, alone.z, atol=1e-9)
+        np.testing.assert_allclose(fit.sigma, alone.sigma, rtol=1e-9)
+    assert chain.solve([]) == []
+
+
+def test_turning_the_map_turns_the_path():
+    drive = sampled(noisy(duration=80.0).log).without(30, 50)
+    turned = dataclasses.replace(drive, east=drive.north, north=-drive.east)
+    a, b = (chain.solve([d])[0].path for d in (drive, turned))
+    np.testing.assert_allclose(b.east, a.north, atol=1e-5)
+    np.testing.assert_allclose(b.north, -a.east, atol=1e-5)
+    np.testing.assert_allclose(b.variance, a.variance[:, ::-1], rtol=1e-4, atol=1e-8)
+
+
+def test_intervals_hold_where_the_model_is_right():
+    inside = []
+    for seed in range(4):
+        made = known(160.0, noise=0.2, speed_noise=0.3, yaw_noise=0.02, rate=5.0, seed=seed)
+        drive = sampled(made.log)
+        path = chain.solve([drive.without(60, 90)])[0].path
+        hidden = (drive.t >= 60) & (drive.t <= 90)
+        error = np.column_stack((path.east - drive.east, path.north - drive.north))[hidden]
+        inside.append(np.mean(np.abs(error) <= 1.645 * np.sqrt(path.variance[hidden] + path.fix_variance)))
+    assert 0.75 < np.mean(inside) <= 1.0
+
+
+@pytest.mark.parametrize("sensor", ["speed_mps", "yaw_rate_radps"])
+def test_one_sensor_is_better_than_none(sensor):
+    made = noisy(duration=120.0)
+    log = dataclasses.replace(made.log, **{sensor: np.full(len(made.log), np.nan)})
+    whole = sampled(made.log)
+    drive = sampled(log).without(50, 60)
+    path = chain.solve([drive])[0].path
+    hidden = whole.seen & ~drive.seen
+    straight = [np.interp(whole.t, whole.t[drive.seen], p[drive.seen]) for p in (whole.east, whole.north)]
+    off = np.hypot(path.east - whole.east, path.north - whole.north)[hidden].mean()
+    line = np.hypot(straight[0] - whole.east, straight[1] - whole.north)[hidden].mean()
+    assert off < 0.5 * line
+
+
+def test_standing_still_all_the_time():
+    t = np.arange(0, 60, 0.2)
+    rng = np.random.default_rng(3)
+    made = known(60.0, rate=5.0)
+    log = dataclasses.replace(
+        made.log,
+        speed_mps=np.zeros(len(made.log)),
+        yaw_rate_radps=1e-3 * rng.standard_normal(len(made.log)),
+        lat_deg=50.0 + 1e-6 * rng.standard_normal(len(made.log)),
+        lon_deg=14.0 + 1e-6 * rng.standard_normal(len(made.log)),
+    )
+    path = chain.solve([sampled(log).without(20, 40)])[0].path
+    assert path.status is Status.OK
+    assert path.finite
+    assert np.ptp(path.east) < 1.0
+    assert t.size == 300
+
+
+def test_a_first_azimuth_points_along_the_way():
+    made = noisy(duration=100.0, bias=0.01)
+    drive = sampled(made.log).without(40, 70)
+    true = made.azimuth[np.searchsorted(made.t, drive.t)]
+    off = np.angle(np.exp(1j * (chain.azimuth_of(drive) - true)))
+    assert np.abs(off).max() < 0.6
+    assert np.abs(off[drive.seen]).mean() < 0.1

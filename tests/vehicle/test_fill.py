@@ -1,0 +1,315 @@
+import dataclasses
+import sys
+import time
+
+import numpy as np
+import pytest
+from tests.vehicle.known import known, real_log
+
+import halfwidth as hw
+from halfwidth.errors import BadLog, BadValue
+from halfwidth.vehicle import calibrate, estimators
+from halfwidth.vehicle.fill import fill
+from halfwidth.vehicle.frames import Frame
+from halfwidth.vehicle.log import Log
+from halfwidth.vehicle.track import Track
+
+NAN = np.nan
+
+
+def drive(**change):
+    return known(**({"duration": 150.0, "noise": 0.2, "speed_noise": 0.05, "yaw_noise": 0.005} | change))
+
+
+def sound(track):
+    """What must hold of every track."""
+    assert isinstance(track, Track)
+    for name in ("lat_deg", "lon_deg", "east_half_m", "north_half_m"):
+        assert np.isfinite(getattr(track, name)).all(), name
+    assert (track.half_m >= 0).all()
+    assert track.guarantee != "proven"
+    fixed = np.isin(track.t_s, track.log.t[track.log.fixed])
+    np.testing.assert_array_equal(track.quality == "fix", fixed)
+    assert fixed.sum() == track.log.fixed.sum()
+    return track
+
+
+def test_a_gap_is_filled_near_the_truth_and_says_how_near():
+    made = drive()
+    track = sound(fill(made.log.without(60, 80)))
+    assert track.method == "em"
+    gap = track.quality == "bridged"
+    t = track.t_s[gap]
+    np.testing.assert_array_equal(t, made.t[(made.t >= 60) & (made.t <= 80)])
+    assert made.error(track.t_s, track.lat_deg, track.lon_deg).max() < 1.5
+    assert track.half_m[gap].max() > 1.2 * track.half_m[~gap].max()
+    assert len(track.gaps) == 1
+    assert track.gaps[0].duration_s == pytest.approx(20.2, abs=0.11)
+    at = np.searchsorted(made.t, track.t_s)
+    np.testing.assert_allclose(track.speed_mps, made.speed[at], atol=0.5)
+    np.testing.assert_allclose(np.cos(track.azimuth_rad - made.azimuth[at]), 1.0, atol=0.02)
+    assert np.nanmax(track.since_fix_s) == pytest.approx(20.1, abs=0.11)
+    np.testing.assert_allclose(track.alt_m, 200.0)
+
+
+def test_half_widths_hold_the_truth_also_with_a_slow_error_of_the_receiver():
+    inside, widest = [], []
+    for seed in range(3):
+        made = drive(duration=240.0, offset=1.0, seed=seed)
+        track = fill(made.log.without(60, 75).without(150, 180))
+        frame = Frame.of(made.log)
+        at = np.searchsorted(made.t, track.t_s)
+        truth = frame.to_local(*_geodetic(made, at))
+        found = frame.to_local(track.lat_deg, track.lon_deg)
+        for axis, half in ((0, track.east_half_m), (1, track.north_half_m)):
+            inside.append(np.mean(np.abs(found[axis] - truth[axis]) <= half))
+        widest.append(track.half_m.max())
+    assert np.mean(inside) > 0.8
+    assert max(widest) < 12.0
+
+
+def _geodetic(made, at):
+    from tests.vehicle.known import FRAME
+
+    return FRAME.to_geodetic(made.east[at], made.north[at])
+
+
+def test_rows_between_usual_fixes_are_not_asked_for():
+    made = drive(fix_every=5)
+    track = sound(fill(made.log.without(60, 70)))
+    assert set(track.quality) == {"fix", "bridged"}
+    bridged = track.t_s[track.quality == "bridged"]
+    assert bridged.min() > 59
+    assert bridged.max() < 71
+    assert np.diff(bridged).max() < 0.11
+
+
+def test_both_ends_are_extrapolated_with_growing_half_widths():
+    made = drive(duration=100.0)
+    track = sound(fill(made.log.without(0, 10).without(90, 100)))
+    assert (track.quality[[0, -1]] == "extrapolated").all()
+    before, after = track.half_m[track.t_s < 9.9], track.half_m[track.t_s > 90.1]
+    assert (np.diff(before) <= 1e-6).all()
+    assert (np.diff(after) >= -1e-6).all()
+    assert np.isnan(track.since_fix_s[0])
+    assert {gap.quality for gap in track.gaps} == {"extrapolated"}
+    assert made.error(track.t_s, track.lat_deg, track.lon_deg).max() < 10
+
+
+def test_a_higher_level_is_wider():
+    log = drive().log.without(60, 80)
+    low, high = fill(log, level=0.5), fill(log, level=0.99)
+    assert (high.half_m > low.half_m).all()
+    np.testing.assert_array_equal(low.lat_deg, high.lat_deg)
+
+
+@pytest.mark.parametrize("name", ["linear", "cv", "gpsins", "ctrv", "em", "paper000+ls", "paper002"])
+def test_every_method_makes_a_track(name):
+    made = known(80.0, rate=5.0, noise=0.1, speed_noise=0.05, yaw_noise=0.005)
+    track = sound(fill(made.log.without(40, 44), method=name))
+    assert track.method == name
+    assert track.half_m[track.quality == "bridged"].max() > 0.05
+    assert made.error(track.t_s, track.lat_deg, track.lon_deg).max() < 6
+
+
+@pytest.mark.parametrize(
+    ("missing", "method", "word"),
+    [
+        (("speed_mps",), "em", "no speed"),
+        (("yaw_rate_radps",), "em", "no yaw rate"),
+        (("speed_mps", "yaw_rate_radps"), "cv", "neither"),
+    ],
+)
+def test_without_sensors_it_does_what_it_can_and_says_so(missing, method, word):
+    made = drive()
+    log = dataclasses.replace(made.log.without(60, 66), **{name: np.full(len(made.log), NAN) for name in missing})
+    track = sound(fill(log))
+    assert track.method == method
+    assert any(word in message for message in track.messages)
+    assert made.error(track.t_s, track.lat_deg, track.lon_deg).max() < 8
+    asked = sound(fill(log, method="gpsins"))
+    assert any("needs the" in message for message in asked.messages)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 8])
+def test_few_fixes_are_enough(n):
+    made = drive(duration=60.0)
+    keep = np.zeros(len(made.log), dtype=bool)
+    keep[np.linspace(100, 500, n).astype(int)] = True
+    log = dataclasses.replace(
+        made.log, lat_deg=np.where(keep, made.log.lat_deg, NAN), lon_deg=np.where(keep, made.log.lon_deg, NAN)
+    )
+    track = sound(fill(log))
+    assert (track.quality == "fix").sum() == n
+    assert (np.diff(track.half_m[track.t_s > 52]) >= 0).all()
+
+
+def test_no_gaps_no_filling():
+    made = drive(duration=60.0)
+    track = sound(fill(made.log))
+    assert (track.quality == "fix").all()
+    assert not track.gaps
+    # the path is better than the fixes it rests on
+    assert (
+        made.error(track.t_s, track.lat_deg, track.lon_deg).mean()
+        < made.error(made.t, made.log.lat_deg, made.log.lon_deg).mean()
+    )
+
+
+def test_a_gap_of_minutes():
+    made = drive(duration=900.0, rate=5.0)
+    track = sound(fill(made.log.without(300, 600)))
+    gap = track.quality == "bridged"
+    off = made.error(track.t_s, track.lat_deg, track.lon_deg)
+    assert off[gap].max() < 3 * track.half_m[gap].max()
+    assert track.half_m[gap].max() < 500
+
+
+def test_one_hertz_everything():
+    made = known(400.0, rate=1.0, noise=0.5, speed_noise=0.1, yaw_noise=0.003)
+    track = sound(fill(made.log.without(200, 220)))
+    assert made.error(track.t_s, track.lat_deg, track.lon_deg).max() < 6
+
+
+def test_a_stop_inside_a_gap():
+    made = drive(stop=(62.0, 75.0))
+    track = sound(fill(made.log.without(55, 85)))
+    stood = (track.t_s > 63) & (track.t_s < 74)
+    east, north = Frame.of(made.log).to_local(track.lat_deg[stood], track.lon_deg[stood])
+    assert np.hypot(np.ptp(east), np.ptp(north)) < 0.5
+
+
+def test_standing_still_for_the_whole_log():
+    t = np.arange(0, 60.05, 0.1)
+    rng = np.random.default_rng(0)
+    lat, lon = 50 + 2e-6 * rng.standard_normal(t.size), 14 + 2e-6 * rng.standard_normal(t.size)
+    log = Log(t=t, lat_deg=lat, lon_deg=lon, speed_mps=0 * t, yaw_rate_radps=1e-3 * rng.standard_normal(t.size))
+    track = sound(fill(log.without(20, 40)))
+    assert track.half_m.max() < 5
+    assert track.gaps[0].distance_m < 5
+
+
+def test_identical_fixes():
+    t = np.arange(0, 30.0, 0.5)
+    log = Log(t=t, lat_deg=np.full(t.size, 50.0), lon_deg=np.full(t.size, 14.0))
+    track = sound(fill(log.without(10, 15)))
+    np.testing.assert_allclose(track.lat_deg, 50.0, atol=1e-6)
+
+
+def test_a_pause_of_the_log_is_not_bridged():
+    made = drive(duration=400.0, rate=5.0)
+    hole = (made.t > 100) & (made.t < 300)
+    log = Log(
+        **{
+            f.name: getattr(made.log, f.name)[~hole]
+            for f in dataclasses.fields(Log)
+            if f.name in ("t", "lat_deg", "lon_deg", "speed_mps", "yaw_rate_radps")
+        }
+    )
+    track = sound(fill(log.without(50, 60)))
+    off = made.error(track.t_s, track.lat_deg, track.lon_deg)
+    assert off.max() < 3.0
+
+
+def test_a_long_log_is_cut_without_seams():
+    made = known(2000.0, rate=5.0, noise=0.1, speed_noise=0.05, yaw_noise=0.003)
+    track = sound(fill(made.log.without(590, 620).without(1195, 1215)))
+    assert made.error(track.t_s, track.lat_deg, track.lon_deg).max() < 3.0
+    east, north = Frame.of(made.log).to_local(track.lat_deg, track.lon_deg)
+    step = np.hypot(np.diff(east), np.diff(north)) - 0.5 * (track.speed_mps[1:] + track.speed_mps[:-1]) * np.diff(
+        track.t_s
+    )
+    assert np.abs(step).max() < 0.5
+
+
+def test_a_method_that_fails_is_replaced_and_the_track_says_so(monkeypatch):
+    broken = dataclasses.replace(
+        estimators.METHODS["gpsins"],
+        run=lambda drives, tuned: [
+            dataclasses.replace(path, east=np.full(path.t.size, NAN))
+            for path in estimators.METHODS["linear"].run(drives, {})
+        ],
+        tune=lambda drive: {},
+    )
+    monkeypatch.setattr(
+        sys.modules["halfwidth.vehicle.fill"], "method_of", lambda name: broken
+    )  # not the function of its name
+    made = drive(duration=60.0, rate=5.0)
+    track = sound(fill(made.log.without(20, 24), method="gpsins"))
+    assert any("no usable path" in message for message in track.messages)
+    assert made.error(track.t_s, track.lat_deg, track.lon_deg).max() < 6
+
+
+def test_the_intervals_are_tested_on_the_log_itself():
+    made = drive(duration=240.0)
+    track = fill(made.log.without(100, 110))
+    assert any("hidden stretches" in message for message in track.messages)
+    rows = track.benchmark
+    assert rows
+    assert rows[0]["stretches"] >= 3
+    assert rows[0]["inflation"] > 0
+    assert any(name.startswith("inflation at") for name in track.settings)
+
+
+def test_inflation_is_interpolated_and_never_below_one():
+    one = calibrate.Tested(2.0, 9, 0.1, 0.2, 0.95, 0.7)
+    two = calibrate.Tested(20.0, 9, 1.0, 2.0, 0.6, 3.0)
+    factor = calibrate.inflation([one, two], np.array([1.0, 2.0, np.sqrt(40.0), 20.0, 90.0]))
+    np.testing.assert_allclose(factor, [1.0, 1.0, np.sqrt(3.0), 3.0, 3.0])
+    np.testing.assert_allclose(calibrate.inflation([], np.array([1.0, 5.0])), 1.0)
+    np.testing.assert_allclose(calibrate.inflation([one], np.array([1.0]), least=0.0), 0.7)
+
+
+def test_wrong_arguments():
+    log = drive(duration=20.0).log
+    for wrong, kind in (
+        ({"level": 1.0}, BadValue),
+        ({"method": "none"}, BadValue),
+        ({"clock_offset": np.inf}, BadValue),
+    ):
+        with pytest.raises(kind):
+            fill(log, **wrong)
+    with pytest.raises(BadLog, match="no fix"):
+        fill(Log(t=[0.0, 1.0, 2.0]))
+
+
+def test_paths_and_frames_are_logs_too(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    log = drive(duration=40.0).log.without(20, 23)
+    frame = log.frame()
+    path = tmp_path / "drive.csv"
+    frame.to_csv(path, index=False)
+    from_frame, from_path = hw.vehicle.fill(frame), hw.vehicle.fill(path)
+    assert isinstance(from_frame.frame(), pandas.DataFrame)
+    np.testing.assert_allclose(from_frame.lat_deg, from_path.lat_deg, atol=1e-9)
+    polars = pytest.importorskip("polars")
+    assert isinstance(hw.vehicle.fill(polars.DataFrame(log.frame("polars"))).frame(), polars.DataFrame)
+
+
+def test_ten_minutes_at_ten_hertz_take_well_under_a_second():
+    log = drive(duration=600.0).log.without(100, 130).without(300, 310).without(450, 510)
+    fill(log.without(0, 590))
+    clock = time.process_time()
+    fill(log)
+    assert time.process_time() - clock < 2.0  # 0.5 s on an idle machine
+
+
+@pytest.mark.parametrize("name", ["smartloc", "balzer", "driveplotr"])
+def test_half_widths_hold_hidden_fixes_of_real_logs(data, name):
+    log = real_log(data, name)
+    frame, inside = Frame.of(log), []
+    for t0 in np.linspace(log.t[0] + 40, log.t[-1] - 60, 5):
+        track = sound(fill(log.without(t0, t0 + 15)))
+        rows = np.flatnonzero(log.fixed & (log.t >= t0) & (log.t <= t0 + 15))
+        if not rows.size:
+            continue
+        at = np.searchsorted(track.t_s, log.t[rows])
+        true, found = (
+            frame.to_local(log.lat_deg[rows], log.lon_deg[rows]),
+            frame.to_local(track.lat_deg[at], track.lon_deg[at]),
+        )
+        inside += [
+            np.mean(np.abs(true[0] - found[0]) <= track.east_half_m[at]),
+            np.mean(np.abs(true[1] - found[1]) <= track.north_half_m[at]),
+        ]
+    assert np.mean(inside) > 0.75

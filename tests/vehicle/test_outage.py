@@ -1,0 +1,142 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from tests.vehicle.known import known, real_log
+
+import halfwidth as hw
+from halfwidth.errors import BadLog, BadValue
+from halfwidth.vehicle.estimators import METHODS
+from halfwidth.vehicle.log import Log
+from halfwidth.vehicle.outage import Outages, outages
+
+FAST = ("linear", "cv", "em")
+
+
+@pytest.fixture(scope="module")
+def log():
+    return known(150.0, noise=0.1, speed_noise=0.05, yaw_noise=0.003, rate=5.0, stop=(60.0, 70.0)).log
+
+
+@pytest.fixture(scope="module")
+def table(log):
+    return outages(log, (1, 5, 20), 6, 3, FAST)
+
+
+def test_all_methods_get_the_same_starts(table):
+    for length in table.lengths:
+        starts = [table.cell(m, length).start for m in table.methods]
+        for other in starts[1:]:
+            np.testing.assert_array_equal(starts[0], other)
+        assert starts[0].size == 6
+
+
+def test_a_seed_is_a_benchmark(log, table):
+    again = outages(log, (5,), 6, 3, ("linear",))
+    assert again.cell("linear", 5).mean == table.cell("linear", 5).mean
+    assert outages(log, (5,), 6, 4, ("linear",)).cell("linear", 5).mean != again.cell("linear", 5).mean
+
+
+def test_the_vehicle_moves_in_every_outage(log):
+    start = outages(log, (5,), 40, 1, ("linear",)).cell("linear", 5).start
+    assert not np.any((start > 60.5) & (start < 64.5))
+
+
+def test_numbers_of_a_straight_line_are_those_of_a_straight_line():
+    made = known(120.0, rate=5.0)
+    cell = outages(made.log, (10,), 5, 1, ("linear",)).cell("linear", 10)
+    for t0, mean, most, n in zip(cell.start, cell.mean_error, cell.max_error, cell.n_fixes, strict=True):
+        seen = (made.t < t0) | (made.t > t0 + 10)
+        off = np.hypot(*(np.interp(made.t, made.t[seen], p[seen]) - p for p in (made.east, made.north)))[~seen]
+        assert (mean, most, n) == pytest.approx((off.mean(), off.max(), off.size), rel=1e-3)
+    assert cell.max == pytest.approx(cell.max_error.mean())
+    assert cell.worst == pytest.approx(cell.max_error.max())
+
+
+def test_the_table_says_everything(table):
+    text = str(table)
+    for word in ("linear", "em", "20 s", "starts", "standard error", "interval"):
+        assert word in text
+    frame = table.frame()
+    assert len(frame) == 9
+    assert set(frame.columns) >= {"method", "length_s", "starts", "mean_m", "max_m", "coverage", "mean_se_m"}
+    assert table.cell("em", 5).coverage is not None
+    data = json.loads(json.dumps(table.to_dict(), allow_nan=False))
+    assert len(data["cells"]) == 9
+    assert table.summary() == text
+    with pytest.raises(BadValue, match="not in the table"):
+        table.cell("em", 7)
+
+
+def test_what_cannot_be_tried_is_said(log):
+    bare = dataclasses.replace(log, speed_mps=np.full(len(log), np.nan), yaw_rate_radps=np.full(len(log), np.nan))
+    table = outages(bare, (5, 500), 3, 1)
+    assert table.methods == ("linear", "cv")
+    assert "no speed" in table.skipped["gpsins"]
+    assert "500 s" in table.skipped
+    assert "em: the log has no speed or yaw rate" in str(table)
+    nothing = outages(bare, (500,), 3, 1)
+    assert not nothing.cells
+    assert "no outage could be tried" in str(nothing)
+
+
+def test_progress_and_settings(log):
+    told = []
+    table = outages(
+        log, (1, 5), 2, 1, ("linear", "cv"), clock_offset=0.1, progress=lambda share, words: told.append((share, words))
+    )
+    assert told[-1] == (1.0, "done")
+    assert [share for share, _ in told] == [0, 0.25, 0.5, 0.75, 1]
+    assert table.clock_offset == 0.1
+    assert isinstance(table, Outages)
+
+
+def test_a_right_clock_offset_helps():
+    log = known(200.0, rate=10.0, noise=0.02, late=0.3).log
+    table = [outages(log, (10,), 6, 1, ("em",), clock_offset=offset).cell("em", 10).mean for offset in (0.0, 0.3, -0.3)]
+    assert table[1] < 0.5 * table[0] < table[2]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"lengths": ()},
+        {"lengths": (-1,)},
+        {"lengths": (np.nan,)},
+        {"starts": 0},
+        {"starts": 1.5},
+        {"methods": ("x",)},
+        {"level": 1.0},
+    ],
+)
+def test_wrong_arguments_are_named(log, wrong):
+    with pytest.raises(BadValue):
+        outages(log, **({"methods": ("linear",)} | wrong))
+
+
+def test_too_few_fixes():
+    with pytest.raises(BadLog, match="at least 3"):
+        outages(Log(t=[0.0, 1.0], lat_deg=[1.0, 1.0], lon_deg=[1.0, 1.0]))
+
+
+def test_it_is_public(log):
+    assert hw.vehicle.outages(log, (2,), 2, 1, ("linear",)).cells[0].method == "linear"
+    assert tuple(hw.vehicle.METHODS) == tuple(METHODS)
+
+
+@pytest.mark.parametrize("name", ["smartloc", "balzer", "driveplotr"])
+def test_the_chain_is_never_worse_than_a_straight_line(data, name):
+    table = outages(real_log(data, name), (1, 2, 5, 10, 20, 30, 60), 3, 1, ("linear", "em"))
+    for length in table.lengths:
+        line, chain = table.cell("linear", length), table.cell("em", length)
+        assert chain.mean <= line.mean
+        assert chain.max <= line.max
+        assert chain.failed == 0
+
+
+@pytest.mark.parametrize(("name", "length", "row"), [("smartloc", 30, 0.42), ("balzer", 30, 4.05)])
+def test_the_chain_is_near_what_is_known_of_it(data, name, length, row):
+    """Means of other random starts, so within their standard errors of 15 to 25 %, both times."""
+    cell = outages(real_log(data, name), (length,), 12, 1, ("em",)).cell("em", float(length))
+    assert cell.mean < row * 1.1 + 2.5 * cell.mean_se
