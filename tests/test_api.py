@@ -7,8 +7,9 @@ import halfwidth as hw
 
 NAMES = """
 BadLog BadRecord BadShape BadValue BatchLP Box Cloud DataQualityWarning Estimate Estimator ExtendedKalman Gaussian
-HalfwidthError KalmanFilter KalmanSmoother Learned Linear LogTooBig Missing Mixed Nonlinear Normal ParticleFilter
-Record Recursive Refused Status Uniform UnscentedKalman Unsolved __version__ estimate forecast from_continuous learn
+HalfwidthError KalmanFilter KalmanSmoother Learned Linear LogTooBig MemoryChoice Missing Mixed Nonlinear Normal ParticleFilter
+Record Recursive Refused SequentialLP Status Uniform UnscentedKalman Unsolved Window __version__ choose_memory
+ensemble_interval estimate forecast from_continuous learn
 resume score simulate stream
 """
 

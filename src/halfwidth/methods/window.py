@@ -534,7 +534,9 @@ def choose_memory(
         errors.append(error)
     assert scale is not None
     scale = np.where(scale > 0, scale, 1.0)
-    each = np.array([np.nanmean(e / scale, axis=1) for e in errors])
+    count_y = np.maximum(np.count_nonzero(~np.isnan(errors[0]), axis=1), 1)
+    lost = np.isnan(errors[0]).all(axis=1)
+    each = np.array([np.where(lost, np.nan, np.nansum(e / scale, axis=1) / count_y) for e in errors])
     score = np.nanmean(each, axis=1)
     top = int(np.argmin(score))
     difference = each - each[top]

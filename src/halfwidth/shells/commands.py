@@ -368,6 +368,33 @@ def doctor(json_: Json = False) -> int:
     return cli.GOOD if found["good"] else cli.INTERNAL
 
 
+# --- reproduce ----------------------------------------------------------------------------------
+
+
+@app.command(epilog="Example: halfwidth reproduce 003 --quick")
+def reproduce(
+    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000 or 003.")],
+    quick: Annotated[bool, typer.Option("--quick", help="A small part of each experiment.")] = False,
+    json_: Json = False,
+) -> int:
+    """Print a source paper's tables beside ours, with notes on what cannot match and why."""
+    from halfwidth import reproduce as papers
+
+    if paper not in papers.PAPERS:
+        known = ", ".join(papers.PAPERS)
+        raise _usage(f"`{paper}` is no paper that is reproduced here, one of {known} is expected", "reproduce 003")
+    found = papers.tables(paper, quick=quick)
+    if json_:
+        tables = [
+            {"title": t.title, "header": list(t.header), "rows": [list(r) for r in t.rows], "notes": list(t.notes)}
+            for t in found
+        ]
+        _print_json({"schema_version": SCHEMA_VERSION, "command": "reproduce", "paper": paper, "tables": tables})
+    else:
+        _out("\n\n".join(table.text() for table in found) + "\n")
+    return cli.GOOD
+
+
 # --- small parts --------------------------------------------------------------------------------
 
 
