@@ -167,8 +167,11 @@ def problem(seed):
     plain = Chain(**given)
     if kind != "scale":
         return kind, plain, plain, 1.0
-    # Units of every state and output differ by up to twelve orders; the objective is scaled with them, or not.
-    unit, out = 10.0 ** rng.uniform(-6, 6, n), 10.0 ** rng.uniform(-6, 6, m)
+    # The same problem with states and outputs in units up to twelve orders apart; or, where the cost is not changed with
+    # them, a problem whose costs differ by three.
+    same = rng.random() < 0.5
+    reach = 6 if same else 1.5
+    unit, out = 10.0 ** rng.uniform(-reach, reach, n), 10.0 ** rng.uniform(-reach, reach, m)
     D, Di = np.diag(unit), np.diag(1 / unit)
     bent = replace(
         plain,
@@ -177,7 +180,7 @@ def problem(seed):
         bx=bx * unit,
         by=np.where(seen, y * out, 0.0),
         E=None if E is None else D @ E @ Di,
-        c=np.r_[1 / unit, 1 / out] if rng.random() < 0.5 else np.ones(n + m),
+        c=np.r_[1 / unit, 1 / out] if same else np.ones(n + m),
         **{k: getattr(plain, k) * unit for k in ("lo", "hi", "x0_lo", "x0_hi") if getattr(plain, k) is not None},
     )
     cost = bent.c * np.r_[unit, out]

@@ -13,7 +13,7 @@ def system(rng, T, n, q):
     B, K = np.zeros((T, q, n)), np.zeros((q, q))
     dense = np.zeros((size, size))
     for t in range(T):
-        for _ in range(n + 2):  # rows that touch t, t-1 and the border, as a residual does
+        for _ in range(n + q + 2):  # rows that touch t, t-1 and the border, as a residual does
             row = np.zeros(size)
             row[t * n : (t + 1) * n] = rng.standard_normal(n)
             if t:

@@ -34,7 +34,7 @@ def test_central_point_is_the_twins(seed):
     if chain.T * 2 < 12:
         chain = plain(seed + 1000, 2)
     ours = solve(chain, point="central", fallback=False)
-    if ours.scale < 1e-5:
+    if ours.scale < 1e-5 * np.abs(chain.by).max():
         return  # fitted but for rounding: there is no path to follow
     x, s, iterations = central(chain)
     assert ours.status is Status.OK
@@ -50,7 +50,8 @@ def test_least_squares_point(seed):
     M, b, _ = dense(chain)
     best = np.linalg.lstsq(M, b, rcond=None)[0]
     ours = solve(chain, point="least_squares").x.ravel()
-    assert np.linalg.norm(M @ ours - b) <= np.linalg.norm(M @ best - b) + 1e-7 * np.linalg.norm(b)
+    # a small ridge holds back what the rows hardly see
+    assert np.linalg.norm(M @ ours - b) <= np.linalg.norm(M @ best - b) + 1e-4 * np.linalg.norm(b)
 
 
 def judged(seed):
