@@ -8,7 +8,7 @@ import pytest
 from halfwidth import _core
 from halfwidth.result import Status
 from halfwidth.solvers.banded import BANDED, Chain, solve
-from halfwidth.solvers.lp import HIGHS, Verdict
+from halfwidth.solvers.lp import HIGHS, PIQP, Verdict
 from halfwidth.solvers.lp import solve as proved
 from tests.naive_lp import central, dense, problem
 
@@ -34,7 +34,7 @@ def test_central_point_is_the_twins(seed):
     if chain.T * 2 < 12:
         chain = plain(seed + 1000, 2)
     ours = solve(chain, point="central", fallback=False)
-    if ours.scale < 1e-5 * np.abs(chain.by).max():
+    if ours.scale < 1e-5 * max(np.abs(chain.bx).max(), np.abs(chain.by[chain.seen]).max(initial=0.0)):
         return  # fitted but for rounding: there is no path to follow
     x, s, iterations = central(chain)
     assert ours.status is Status.OK
@@ -57,9 +57,9 @@ def test_least_squares_point(seed):
 def judged(seed):
     """Return (kind, what is wrong or None, whether the core needed help)."""
     kind, chain, reference, factor = problem(seed)
-    truth = proved(reference.program(), (HIGHS,))
+    truth = proved(reference.program(), (HIGHS, PIQP))
     ours = solve(chain, point="optimal")
-    helped = ours.by != "banded"
+    helped = ours.by != "banded" and ours.status is not Status.INFEASIBLE
     if truth.verdict is Verdict.INFEASIBLE:
         return kind, None if ours.status is Status.INFEASIBLE else f"{ours.status} for infeasible", helped
     if not ours.status.good:
@@ -68,7 +68,9 @@ def judged(seed):
     # An objective of 0 is met up to rounding of the data.
     data = np.abs(np.where(chain.seen, chain.by, 0.0)).max(axis=0, initial=0.0)
     size = np.r_[np.abs(chain.bx).max(axis=0), data] * chain.c[chain.group] if kind != "shared" else np.ones(1)
-    if abs(ours.objective - best) > 1e-7 * abs(best) + 1e-11 * size.max():
+    # Where neither stock solver proves its optimum to 1e-7, agreement is asked for to what it does prove.
+    reach = max(1e-7, truth.check.gap if truth.verdict is not Verdict.OPTIMAL else 0.0)
+    if abs(ours.objective - best) > reach * abs(best) + 1e-10 * size.max():
         return kind, f"{ours.objective} for {best}, {ours.status} by {ours.by}", helped
     return kind, None, helped
 
@@ -88,7 +90,7 @@ def test_the_core_alone_never_claims_what_is_wrong():
     for seed in range(0, 280, 3):
         _, chain, reference, factor = problem(seed)
         ours = solve(chain, point="optimal", fallback=False)
-        truth = proved(reference.program(), (HIGHS,))
+        truth = proved(reference.program(), (HIGHS, PIQP))
         if ours.status is Status.INFEASIBLE:
             assert truth.verdict is Verdict.INFEASIBLE
         elif ours.status is Status.OK and truth.x is not None:
