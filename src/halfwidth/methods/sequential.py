@@ -40,6 +40,8 @@ from halfwidth.spread import Box, Normal
 _STEPS = (1.0, 0.5, 0.25, 0.1, 0.03)
 #: Rounds in which the scale of each group is found for a nonlinear model.
 _SCALINGS = 3
+#: A scale stays above this share of the cap (or of the first residuals): a smooth fit must not make one vanish.
+_LEAST = 0.03
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +135,8 @@ class SequentialLP:
             for share in _STEPS:
                 x_new, theta_new = x + share * (answer.x - x), theta + share * (answer.theta - theta)
                 value = rows.worth(x_new, theta_new, c)
-                if value < best or len(history) == 1:
+                # The first point comes from least squares, which a central point need not beat.
+                if value < best or (len(history) == 1 and value < 2.0 * best):
                     break
             else:
                 break
@@ -369,12 +372,13 @@ class NonlinearRows:
         """Return N_j / sigma_j with the noise level of a least-squares fit about x."""
         count = np.r_[np.full(self.nx, len(self.record)), self.record.seen.sum(axis=0)].astype(float)
         sigma = np.where(np.isfinite(self.cap), self.cap, np.nanstd(self.residuals(x, theta), axis=0) + 1e-12)
+        least = _LEAST * sigma
         for _ in range(_SCALINGS):
             chain = self.chain(x, theta, 1.0 / np.maximum(sigma, 1e-300))
             smooth = solve(chain, point="least_squares", fallback=False).x
             rho = chain_residuals(chain, smooth)
             level = np.sqrt(np.nanmean(np.where(np.isnan(rho), 0.0, rho) ** 2, axis=0))
-            sigma = np.maximum(level, 1e-3 * sigma)
+            sigma = np.maximum(level, least)
         return scaled_costs(count, sigma)
 
 

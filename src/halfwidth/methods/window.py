@@ -93,7 +93,7 @@ class Window:
     array([4, 5])
     """
 
-    method: Estimator
+    method: Estimator = dataclasses.field(default_factory=BatchLP)
     memory: int = 25
     carry: float | None = None
     fixes: int = 3
