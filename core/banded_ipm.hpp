@@ -462,6 +462,11 @@ struct BandedIpm {
             zref[p0 + c] = 0.0;
         }
         for (int j = 0; j < rows; j++) kappa[j] = 1.0 / (lp.h[j] * sz[p0 + lp.group[j]]);
+        for (int j = 0; j < m; j++) {  // share of the rows in which an output is seen
+            int c = 0;
+            for (I t = 0; t < T; t++) c += lp.seen[t * m + j];
+            count[n + j] = double(c) / T;
+        }
         // columns of x by their norm over one row of the record, the mean over time where matrices move
         const int TA = lp.A_t ? T : 1, TC = lp.C_t ? T : 1, TE = lp.E_t ? T : 1;
         for (int k = 0; k < n; k++) {
@@ -469,7 +474,10 @@ struct BandedIpm {
             for (int t = 0; t < TA; t++)
                 for (int j = 0; j < n; j++) a += square(kappa[j] * lp.A[(I(t) * n + j) * n + k]);
             for (int t = 0; t < TC; t++)
-                for (int j = 0; j < m; j++) c += square(kappa[n + j] * lp.C[(I(t) * m + j) * n + k]);
+                for (int j = 0; j < m; j++) {
+                    const double share = TC > 1 ? double(lp.seen[I(t) * m + j]) : count[n + j];
+                    c += share * square(kappa[n + j] * lp.C[(I(t) * m + j) * n + k]);
+                }
             if (unit_E) e = square(kappa[k]);
             else
                 for (int t = 0; t < TE; t++)
@@ -645,6 +653,10 @@ struct BandedIpm {
             double top_c = 0.0, n_c = 0.0;
             for (int j = 0; j < rows; j++)
                 if (lp.group[j] == c) top_c = max2(top_c, hmax[j] / S), n_c += count[j];
+            if (n_c == 0.0) {  // bounds no row: it stays on its floor and is no part of the path
+                z[p0 + c] = zhi[p0 + c] = zlo[p0 + c];
+                continue;
+            }
             double s = 1.2 * top_c + 1e-3;
             s = max2(s, zlo[p0 + c] + 1e-3);
             z[p0 + c] = s;

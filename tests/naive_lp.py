@@ -49,7 +49,9 @@ def central(chain, gap=0.3, iterations=50):
     A, C = np.atleast_3d(chain.A.T).T, np.atleast_3d(chain.C.T).T
     E = np.eye(n)[None] if chain.E is None else np.atleast_3d(chain.E.T).T
     k_row = cost[chain.group] / chain.h
-    norm = sum(((k[None, :, None] * X) ** 2).mean(axis=0).sum(axis=0) for k, X in ((k_row[:n], A), (k_row[n:], C), (k_row[:n], E)))
+    share = np.r_[np.ones(n), chain.seen.mean(axis=0)]
+    parts = ((k_row[:n], share[:n], A), (k_row[n:], share[n:], C), (k_row[:n], share[:n], E))
+    norm = sum((f[:, None] * ((k[None, :, None] * X) ** 2).mean(axis=0)).sum(axis=0) for k, f, X in parts)
     sx = np.tile(1.0 / np.sqrt(norm), T + 1)
     M = kappa[:, None] * M * sx
     b = kappa * b

@@ -49,7 +49,7 @@ from halfwidth.solvers.banded import POINTS, Chain, chain_of, solve
 from halfwidth.spread import Box
 
 _STATUS = (Status.OK, Status.REDUCED, Status.INFEASIBLE, Status.STALLED)
-#: Rows, in units of the window, from which the scales of the objective are found.
+#: Rows, in units of the window, from which the scales of `SequentialLP` are found.
 _FIRST = 4
 
 
@@ -113,7 +113,8 @@ class Window:
 
     def refuses(self, model: Model) -> str | None:
         """Return why the method inside cannot take the model, or None."""
-        return self.method.refuses(model)
+        reason = self.method.refuses(model)
+        return None if reason is None else f"inside `Window`, {reason}"
 
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:
         """Estimate the newest state at every row."""
@@ -141,12 +142,20 @@ class Window:
         chain = window_chain(method, model, record, self.memory)
         if chain is None:
             return None
+        assert isinstance(model.x0, Box)
         c = chain
         filtered, smoothed, s, low, high, codes, seconds = _core.lp_windows(
             c.E, c.A, c.C, c.bx, c.by, c.seen, c.lo, c.hi, c.x0_lo, c.x0_hi, c.group, c.h, c.c, c.floor, c.cap,
             start, self.memory, self.carry or 0.0, POINTS[method.point],
         )  # fmt: skip
         found = _Found(filtered, smoothed, s, low, high, [_STATUS[k] for k in codes[0]], codes[1], None, seconds)
+        if method.objective == "scaled":
+            # Before the first full window the scales are those of the rows there are.
+            for t in range(min(self.memory, len(record))):
+                early = replace(chain.part(0, t + 1), c=first_costs(model, record, t + 1))
+                answer = solve(early, point=method.point)
+                found.statuses[t], found.filtered[t], found.s[t] = answer.status, answer.x[-1], answer.s
+                codes[0][t] = 0
         for t in np.flatnonzero(codes[0] >= 2):
             # What the core does not certify is asked of the stock solvers, which also prove infeasibility.
             answer = solve(chain.part(int(start[t]), int(t) + 1), point="optimal")
@@ -427,25 +436,25 @@ def rows_since_fix(seen: NDArray[np.bool_]) -> NDArray[np.int_]:
 def window_chain(method: BatchLP, model: Linear, record: Record, memory: int) -> Chain | None:
     """Return the chain of a record with the costs that its windows share, or None if it is none.
 
-    Scales come from the first few windows' rows, so that they look ahead no further.
+    The scales are those of the first full window, so that a stream has them too.
     """
     floor, cap = half_width_bounds(model)
     chain = chain_of(model, record, np.ones(model.nx + model.ny), floor, cap)
-    if chain is None:
-        return None
-    if method.objective == "paper":
+    if chain is None or method.objective == "paper":
         return chain
-    T = len(record)
-    b = min(T, _FIRST * (memory + 1))
-    while b < T and not chain.seen[:b].any(axis=0).all():
-        b = min(T, 2 * b)
+    return replace(chain, c=first_costs(model, record, memory + 1))
+
+
+def first_costs(model: Linear, record: Record, rows: int) -> Array:
+    """Return N_j / sigma_j of each group from the first rows of a record."""
+    b = min(len(record), rows)
     first = Record(record.t[:b], record.y[:b], None if record.u is None else record.u[:b])
     cut = {k: m.value[:b] for k, m in model.matrices.items() if m.value is not None and m.value.ndim == 3}
     short = replace(model, **cut) if cut else model  # type: ignore[arg-type]
-    known = np.where(floor == cap, floor / math.sqrt(3.0), 0.0)
-    base = reference(residuals(short, first), short, known)
-    count = np.r_[np.full(model.nx, b), chain.seen[:b].sum(axis=0)]
-    return replace(chain, c=scaled_costs(count, base.sigma))
+    floor, cap = half_width_bounds(model)
+    base = reference(residuals(short, first), short, np.where(floor == cap, floor / math.sqrt(3.0), 0.0))
+    count = np.r_[np.full(model.nx, b), first.seen.sum(axis=0)]
+    return scaled_costs(count, base.sigma)
 
 
 def _meet(box: Box, other: Box) -> Box:
@@ -580,6 +589,8 @@ class _Live:
     def __init__(self, window: Window, model: Model, t: float) -> None:
         self.window, self.model, self.t, self.pushed = window, model, t, 0
         self.times: list[float] = []
+        self.before = t  # time of the row before the first one held
+        self.costs: Array | None = None
         self.y: list[Array] = []
         self.u: list[Array] = []
         self.method = typed(window)
@@ -607,12 +618,15 @@ class _Live:
         a = int(window_starts(seen, self.window.memory, fixes=self.window.fixes, stretch=self.window.stretch)[-1])
         part = Record(self.times[a:], np.array(self.y[a:]), np.array(self.u[a:]) if model.nu else None)
         local = model
-        if first + a > 0 and isinstance(model.x0, Box):
+        if isinstance(model.x0, Box):
             free = Box(np.full(model.nx, -np.inf), np.full(model.nx, np.inf))
-            local = replace(model, x0=model.bounds or free)
-        est = self.window.method.run(local, part)
-        # Rows before this window's start can never be needed again unless every output was seen by then.
+            changes: dict[str, Any] = {} if first + a == 0 else {"x0": model.bounds or free}
+            gap = self.times[a] - (self.times[a - 1] if a else self.before)
+            local = replace(model, dt=gap, **changes)
+        est = self._solve(local, part)
+        # Starts never move back, so rows before this window's are not needed again.
         if a > 0:
+            self.before = self.times[a - 1]
             del self.times[:a], self.y[:a]
             if self.u:
                 del self.u[:a]
@@ -627,9 +641,31 @@ class _Live:
             info=info | {"extrapolated": since > 0, "since_fix": since, "rows": len(part)},
         )
 
+    def _solve(self, model: Model, part: Record) -> Estimate:
+        """Estimate one window: the linear program itself where it is known, else the method's `run`."""
+        method = self.window.method
+        if isinstance(method, BatchLP) and isinstance(model, Linear) and method.objective != "log":
+            point = method.point
+            floor, cap = half_width_bounds(model)
+            chain = None if point == "least_squares" else chain_of(model, part, np.ones(len(floor)), floor, cap)
+            if chain is not None and point != "least_squares":
+                costs = self.costs
+                if method.objective == "scaled" and costs is None:
+                    costs = first_costs(model, part, self.window.memory + 1)
+                    self.costs = costs if self.pushed > self.window.memory else None
+                answer = solve(chain if costs is None else replace(chain, c=costs), point=point)
+                good, nx = answer.status.good, model.nx
+                return Estimate(
+                    part.t, answer.x[1:], None, answer.status, self.method,
+                    q=answer.s[:nx] if good else None, r=answer.s[nx:] if good else None, names=model.names.x,
+                    info={"iterations": answer.iterations, "solver": answer.by, "objective": answer.objective},
+                )  # fmt: skip
+        return method.run(model, part)
+
     def snapshot(self) -> bytes:
         """Return the rows held, as bytes."""
-        rows = {"t": self.t, "pushed": self.pushed, "times": self.times}
+        rows: dict[str, Any] = {"t": self.t, "pushed": self.pushed, "times": self.times, "before": self.before}
+        rows["costs"] = None if self.costs is None else self.costs.tolist()
         rows |= {"y": [[None if math.isnan(v) else v for v in row] for row in self.y], "u": [list(r) for r in self.u]}
         return json.dumps(rows).encode()
 
@@ -637,6 +673,8 @@ class _Live:
         """Take up the rows of a snapshot."""
         rows = json.loads(saved)
         self.t, self.pushed, self.times = float(rows["t"]), int(rows["pushed"]), [float(v) for v in rows["times"]]
+        self.before = float(rows["before"])
+        self.costs = None if rows["costs"] is None else np.array(rows["costs"], dtype=float)
         self.y = [np.array([np.nan if v is None else v for v in row], dtype=float) for row in rows["y"]]
         self.u = [np.array(row, dtype=float) for row in rows["u"]]
 
