@@ -70,7 +70,7 @@ def clarabel(program):
     return found.obj_val
 
 
-def floor_of(T, n=4, m=2, p=6, lanes=4, ghz=2.6):
+def floor_of(n=4, m=2, p=6):
     """Return (bytes, flops) an iteration moves and computes at least, per stage."""
     g, q = n + m, n + p
     state = n + 4 * g + 4 * g + g + n  # x; w, l, u, v; b; base
@@ -90,10 +90,14 @@ def batch(lengths, quick):
         runs = 9 if T <= 1000 else 3
         took, ours = cpu(lambda chain=chain: solve(chain, point="optimal", fallback=False), runs)
         each = 1e6 * took / T / max(1, ours.iterations)
-        print(f"{T:8d} {'banded optimal':>16} {1e3 * took:10.2f} {1:7.1f} {ours.objective:14.9f} {ours.iterations:4d} {each:12.3f}")
+        print(
+            f"{T:8d} {'banded optimal':>16} {1e3 * took:10.2f} {1:7.1f} {ours.objective:14.9f} {ours.iterations:4d} {each:12.3f}"
+        )
         fast, middle = cpu(lambda chain=chain: solve(chain, fallback=False), runs)
-        print(f"{'':8} {'banded central':>16} {1e3 * fast:10.2f} {fast / took:7.2f} {middle.objective:14.9f} {middle.iterations:4d}")
-        size, flops = floor_of(T)
+        print(
+            f"{'':8} {'banded central':>16} {1e3 * fast:10.2f} {fast / took:7.2f} {middle.objective:14.9f} {middle.iterations:4d}"
+        )
+        size, flops = floor_of()
         print(
             f"{'':8} an iteration moves {size} bytes and computes {flops} flops a stage:"
             f" {size / each / 1e3:.1f} GB/s and {flops / each / 1e3:.1f} Gflop/s reached"
@@ -158,7 +162,9 @@ def memory_of(T):
     chain = drive(T)
     took, found = cpu(lambda: solve(chain, fallback=False), 1)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    print(f"\nT = {T}: central point {took:.1f} s, {found.iterations} iterations, {found.status.name}, peak {peak:.2f} GB")
+    print(
+        f"\nT = {T}: central point {took:.1f} s, {found.iterations} iterations, {found.status.name}, peak {peak:.2f} GB"
+    )
 
 
 def agreement(problems):

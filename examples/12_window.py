@@ -33,8 +33,8 @@ def main():
     # Unknown entries: E makes the noise of the states correlated, and NaN says that we do not know how.
     nan = float("nan")
     model = hw.Linear(
-        [[0.9, 0.2], [0, 0.8]], [[1], [0.5]], np.eye(2), hw.Uniform.unknown(at_most=1.0), hw.Uniform.unknown(at_most=1.0),
-        None, E=[[1, nan], [0, 1]], theta_bounds=(0, 1),
+        [[0.9, 0.2], [0, 0.8]], [[1], [0.5]], np.eye(2), unknown, unknown, None,
+        E=[[1, nan], [0, 1]], theta_bounds=(0, 1),
     )  # fmt: skip
     true = hw.Linear(
         model.A, model.B, model.C, hw.Uniform(0.1), hw.Uniform(0.05), hw.Box([0, 0], [0, 0]), E=[[1, 0.4], [0, 1]]

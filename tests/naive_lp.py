@@ -76,28 +76,30 @@ def central(chain, gap=0.3, iterations=50):
     low = chain.floor * cost / S
     w = np.r_[U @ s + b, U @ s - b, s - low]
     lam = (1.0 / (2 * np.maximum(count, 1)))[group]
-    l = np.r_[lam, lam, np.zeros(ns)]
-    mu = (w[: 2 * N] @ l[: 2 * N]) / (2 * N)
-    l[2 * N :] = mu / w[2 * N :]
+    lm = np.r_[lam, lam, np.zeros(ns)]
+    mu = (w[: 2 * N] @ lm[: 2 * N]) / (2 * N)
+    lm[2 * N :] = mu / w[2 * N :]
     c = np.r_[np.zeros(M.shape[1]), np.ones(ns)]
     for it in range(iterations):
         value = s.sum()
-        if w @ l <= gap * (abs(value) + 1e-6):
+        if w @ lm <= gap * (abs(value) + 1e-6):
             return (sx * (x0 + S * x)).reshape(T + 1, n), S * s / cost, it
-        H = J.T @ ((l / w)[:, None] * J) + np.diag(np.r_[np.full(M.shape[1], 1e-9 / (T + 1)), np.full(ns, 1e-9 / (T + 1))])
+        H = J.T @ ((lm / w)[:, None] * J) + np.diag(
+            np.r_[np.full(M.shape[1], 1e-9 / (T + 1)), np.full(ns, 1e-9 / (T + 1))]
+        )
         step = np.linalg.solve(H, -c)
         u = J @ step / w
         v = -1 - u
         ap, ad = min(1, 1 / max(-u.min(), 1e-300)), min(1, 1 / max(-v.min(), 1e-300))
-        mu, affine = w @ l / len(w), (w * (1 + ap * u)) @ (l * (1 + ad * v)) / len(w)
+        mu, affine = w @ lm / len(w), (w * (1 + ap * u)) @ (lm * (1 + ad * v)) / len(w)
         sigma = max(min((affine / mu) ** 3, 1.0), 0.2)
-        zeta = (sigma * mu + w * l * u * (1 + u)) / w
+        zeta = (sigma * mu + w * lm * u * (1 + u)) / w
         step = np.linalg.solve(H, -c + J.T @ zeta)
         un = J @ step / w
-        vn = -1 - un + zeta / l
+        vn = -1 - un + zeta / lm
         ap, ad = min(1, 0.9 / max(-un.min(), 1e-300)), min(1, 0.9 / max(-vn.min(), 1e-300))
         x, s = x + ap * step[: M.shape[1]], s + ap * step[M.shape[1] :]
-        w, l = w * (1 + ap * un), l * (1 + ad * vn)
+        w, lm = w * (1 + ap * un), lm * (1 + ad * vn)
     raise AssertionError("no central point")
 
 

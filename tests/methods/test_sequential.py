@@ -12,7 +12,9 @@ SMALL = hw.Uniform.unknown(at_most=1.0)
 
 def test_a_noise_free_parameter_is_exact():
     decay = hw.Linear([[NAN]], None, [[1]], SMALL, SMALL, None, theta_bounds=(0.0, 1.0))
-    est = hw.estimate(decay, hw.Record(range(20), [0.9**k for k in range(20)]), hw.SequentialLP(point="optimal")).check()
+    est = hw.estimate(
+        decay, hw.Record(range(20), [0.9**k for k in range(20)]), hw.SequentialLP(point="optimal")
+    ).check()
     assert est.theta == pytest.approx([0.9], abs=1e-6)
     assert est.q == pytest.approx([0], abs=1e-6)
 
@@ -41,7 +43,14 @@ def test_an_unknown_entry_of_each_matrix(matrix):
 
 def test_the_linearisation_is_the_derivative():
     model = hw.Linear(
-        [[NAN, 0.2], [0.1, 0.5]], [[1], [NAN]], [[1, NAN]], SMALL, SMALL, None, E=[[1, NAN], [0, 1]], theta_bounds=(-1, 1)
+        [[NAN, 0.2], [0.1, 0.5]],
+        [[1], [NAN]],
+        [[1, NAN]],
+        SMALL,
+        SMALL,
+        None,
+        E=[[1, NAN], [0, 1]],
+        theta_bounds=(-1, 1),
     )
     rng = np.random.default_rng(0)
     record = hw.Record(np.arange(6.0), rng.normal(size=(6, 1)), rng.normal(size=(6, 1)))
@@ -83,7 +92,12 @@ def test_a_nonlinear_model():
     model = hw.Nonlinear(g, lambda x: x[:1], hw.Uniform(0.005), hw.Uniform(0.1), hw.Box([0.9, -0.1], [1.1, 0.1]), nu=1)
     truth, record = hw.simulate(model, np.zeros(150), seed=0)
     unknown = hw.Nonlinear(
-        g, lambda x: x[:1], hw.Uniform.unknown(at_most=0.1), hw.Uniform.unknown(at_most=1.0), hw.Box([0, -1], [2, 1]), nu=1
+        g,
+        lambda x: x[:1],
+        hw.Uniform.unknown(at_most=0.1),
+        hw.Uniform.unknown(at_most=1.0),
+        hw.Box([0, -1], [2, 1]),
+        nu=1,
     )
     est = hw.estimate(unknown, record.without(50.0, 60.0), hw.SequentialLP()).check()
     assert np.abs(est.x - truth.x).mean() < 0.06

@@ -27,7 +27,9 @@ def test_a_window_is_the_batch_on_its_rows():
         a = max(0, t - 10)
         part = hw.Record(record.t[a : t + 1], record.y[a : t + 1], record.u[a : t + 1])
         alone = hw.estimate(CART, part, method)
-        assert est.info["q"][t].sum() + est.info["r"][t].sum() == pytest.approx(alone.info["objective"], rel=1e-6, abs=1e-9)
+        assert est.info["q"][t].sum() + est.info["r"][t].sum() == pytest.approx(
+            alone.info["objective"], rel=1e-6, abs=1e-9
+        )
 
 
 def test_the_general_way_and_the_fast_way_agree():
@@ -36,7 +38,9 @@ def test_the_general_way_and_the_fast_way_agree():
     window = hw.Window(method, memory=8)
     fast = window.run(CART, record)
     slow = window._any(CART, record, fast.info["start"], None)
-    np.testing.assert_allclose(fast.info["q"].sum(axis=1) + fast.info["r"].sum(axis=1), slow.s.sum(axis=1), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        fast.info["q"].sum(axis=1) + fast.info["r"].sum(axis=1), slow.s.sum(axis=1), rtol=1e-6, atol=1e-9
+    )
 
 
 def test_windows_stretch_until_every_output_has_fixes():

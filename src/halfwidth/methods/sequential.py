@@ -192,7 +192,7 @@ class LinearRows:
         return found
 
     def columns(self, x: Array, a: int = 0, b: int | None = None) -> Array:
-        """Return the derivative of every row by theta at states x (rows + 1, nx), for rows a to b: (rows, groups, p)."""
+        """Return the derivative of rows a to b by theta at states x (rows + 1, nx): (rows, groups, p)."""
         y, u = self.y[a:b], None if self.record.u is None else self.record.u[a:b]
         G = np.zeros((len(y), self.groups, len(self.lo)))
         for k, (name, i, j) in enumerate(self.entries):
@@ -424,7 +424,7 @@ def half_width_bounds(model: Model) -> tuple[Array, Array]:
 def largest(rho: Array, floor: Array) -> Array:
     """Return the largest |rho| of each group, at least its floor."""
     top = np.max(np.where(np.isnan(rho), 0.0, np.abs(rho)), axis=0, initial=0.0)
-    return np.maximum(top, floor)
+    return np.asarray(np.maximum(top, floor))
 
 
 def scaled_costs(count: Array, sigma: Array) -> Array:

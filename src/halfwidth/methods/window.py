@@ -29,7 +29,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from halfwidth import _core
+import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadRecord, BadValue, Refused
 from halfwidth.methods._protocol import Estimator, typed
@@ -74,9 +74,9 @@ class Window:
     Notes
     -----
     ``x[k]`` is the newest state of the window that ends at row k. In ``info``: ``smoothed`` (T, nx), the last
-    estimate of each state; ``low``, ``high`` and ``windows``, what `ensemble_interval` needs; ``q``, ``r``, ``theta`` of every
-    window; ``start``, ``extrapolated``, ``statuses`` of every row. ``q``, ``r``, ``theta`` of the estimate are the last
-    window's. The status is the worst of all windows.
+    estimate of each state; ``low``, ``high`` and ``windows``, what `ensemble_interval` needs; ``q``, ``r``, ``theta``
+    of every window; ``start``, ``extrapolated``, ``statuses`` of every row. Those of the estimate
+    itself are the last window's; its status is the worst of all windows.
 
     Raises
     ------
@@ -156,9 +156,9 @@ class Window:
                 answer = solve(early, point=method.point)
                 found.statuses[t], found.filtered[t], found.s[t] = answer.status, answer.x[-1], answer.s
                 codes[0][t] = 0
-        for t in np.flatnonzero(codes[0] >= 2):
+        for t in np.flatnonzero(codes[0] >= 2).tolist():
             # What the core does not certify is asked of the stock solvers, which also prove infeasibility.
-            answer = solve(chain.part(int(start[t]), int(t) + 1), point="optimal")
+            answer = solve(chain.part(int(start[t]), t + 1), point=method.point)
             found.statuses[t] = answer.status
             if answer.status.good:
                 found.filtered[t], found.s[t] = answer.x[-1], answer.s
@@ -216,7 +216,7 @@ class Window:
         E = new.get("E", None)
         if E is None and model.E is not None:
             E = model.E.at(float(record.t[t]), dt, t)
-        return moved if E is None else np.linalg.solve(E, moved)
+        return np.asarray(moved if E is None else np.linalg.solve(E, moved), dtype=np.float64)
 
     def _any(self, model: Model, record: Record, start: NDArray[np.int32], seed: int | None) -> "_Found":
         """Run the method on each window's own record."""
@@ -616,7 +616,7 @@ class _Live:
         self.pushed += 1
         seen = ~np.isnan(np.array(self.y))
         a = int(window_starts(seen, self.window.memory, fixes=self.window.fixes, stretch=self.window.stretch)[-1])
-        part = Record(self.times[a:], np.array(self.y[a:]), np.array(self.u[a:]) if model.nu else None)
+        part = Record(np.array(self.times[a:]), np.array(self.y[a:]), np.array(self.u[a:]) if model.nu else None)
         local = model
         if isinstance(model.x0, Box):
             free = Box(np.full(model.nx, -np.inf), np.full(model.nx, np.inf))

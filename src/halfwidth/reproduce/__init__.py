@@ -1,7 +1,7 @@
 """The source papers' tables beside ours: `tables(number)` returns them as plain values, `text` prints them.
 
-Every paper is one module with ``tables(*, quick=False) -> tuple[Table, ...]`` and ``figures(folder)``. Reference numbers
-are those printed in the papers; notes say what cannot match and why.
+Every paper is one module with ``tables(*, quick=False) -> tuple[Table, ...]`` and ``figures(folder)``. Reference
+numbers are those printed in the papers; notes say what cannot match and why.
 """
 
 import importlib

@@ -35,7 +35,7 @@ POINTS = ("central", "least_squares", "optimal")
 def vehicle(w: Noise, e: Noise, x0: Box | Normal | None) -> Linear:
     """Return the model of eqs. (22) and (23): position and velocity in the plane, acceleration as input."""
     return Linear(
-        [[1, 0, H, 0], [0, 1, 0, H], [0, 0, 1, 0], [0, 0, 0, 1]],
+        np.array([[1, 0, H, 0], [0, 1, 0, H], [0, 0, 1, 0], [0, 0, 0, 1]]),
         [[H * H / 2, 0], [0, H * H / 2], [H, 0], [0, H]],
         [[1, 0, 0, 0], [0, 1, 0, 0]],
         w,
@@ -93,7 +93,8 @@ def figure_three(*, quick: bool = False) -> Table:
     runs = [errors(seed, 5.0) for seed in seeds]
     body = []
     for a in range(0, 50, 5):
-        body.append((round(H * (a + 2), 1), *[round(float(np.mean([r[n][a : a + 5] for r in runs])), 3) for n in runs[0]]))
+        means = [round(float(np.mean([r[n][a : a + 5] for r in runs])), 3) for n in runs[0]]
+        body.append((round(H * (a + 2), 1), *means))
     return Table(
         "Figure 3: mean position error in an outage of 5 s, m", ("s into it", *runs[0]), tuple(body),
         ("Largest in the middle, as in the report.",),

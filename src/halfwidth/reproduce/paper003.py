@@ -255,7 +255,8 @@ def table_two(*, quick: bool = False) -> Table:
                 assert drawn.record.u is not None
                 ahead = (x[:-1] @ A.T + drawn.record.u[1:] @ B.T) @ C.T
                 predicted.append(np.abs(drawn.record.y[1:] - ahead)[25:].mean(axis=0))
-            add(name, f"{factor} x covariance", np.concatenate([np.mean(v, axis=0) for v in (error, residual, predicted)]))
+            means = [np.mean(v, axis=0) for v in (error, residual, predicted)]
+            add(name, f"{factor} x covariance", np.concatenate(means))
     return Table(
         "Table II: mean absolute errors of states x and outputs y",
         ("estimator", "which", "x1", "x2", "x3", "y1", "y2", "y1 ahead", "y2 ahead"),
@@ -339,7 +340,9 @@ def central_gain(*, quick: bool = False) -> Table:
     for name, values in errors.items():
         body.append((name, len(values), round(float(np.mean(values)), 4), round(top / float(np.mean(values)), 2)))
     return Table(
-        "Filter error by the point of the optimal face, memory 25", ("point", "windows", "mean |error|", "gain"), tuple(body)
+        "Filter error by the point of the optimal face, memory 25",
+        ("point", "windows", "mean |error|", "gain"),
+        tuple(body),
     )
 
 

@@ -24,7 +24,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth import _core
+import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.model import Linear
 from halfwidth.record import Record
@@ -95,7 +95,7 @@ class Chain:
     def part(self, a: int, b: int) -> "Chain":
         """Return the chain of rows a to b - 1; the box of x_0 stays with row 0 alone."""
 
-        def cut(matrix: Array | None, rows: int = 3, more: int = 0) -> Array | None:
+        def cut(matrix: Any, rows: int = 3, more: int = 0) -> Any:
             return matrix if matrix is None or matrix.ndim < rows else matrix[a : b + more]
 
         return replace(
@@ -129,9 +129,7 @@ class Chain:
         rows = [t * nx + i, t * nx + i, np.repeat(np.arange(T * nx, K), nx)]
         columns = [t * nx + j, (t + 1) * nx + j, ((seen_t + 1)[:, None] * nx + np.arange(nx)).ravel()]
         values = [-A[t, i, j], E[t, i, j], C[seen_t, seen_j].ravel()]
-        M = sp.csr_array(
-            (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(K, n)
-        )
+        M = sp.csr_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(K, n))
         M.eliminate_zeros()
         b = np.r_[self.bx.ravel(), self.by[seen_t, seen_j]]
         if self.G is not None:
@@ -220,9 +218,7 @@ def solve(
         Its status is OK only with a relative gap of at most 1e-8 (or `central_gap`); INFEASIBLE only with a proof.
     """
     c = chain
-    x, theta, s, lam, slack, info = _core.lp_solve(
-        *_arrays(c), POINTS[point], tol, central_gap, max_iter, multipliers
-    )
+    x, theta, s, lam, slack, info = _core.lp_solve(*_arrays(c), POINTS[point], tol, central_gap, max_iter, multipliers)
     status = _STATUS[info["status"]]
     answer = Answer(
         x, theta, s, lam, slack, status, info["objective"], info["gap"], info["iterations"], info["scale"], "banded"
