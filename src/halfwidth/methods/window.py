@@ -223,10 +223,15 @@ class Window:
         T = len(record)
         found = _Found.empty(T, model.nx, model.nx + model.ny, len(getattr(model, "theta_entries", ())))
         x = np.zeros((T + 1, model.nx))
+        costs: Array | None = None
         for t in range(T):
             a = int(start[t])
             part = Record(record.t[a : t + 1], record.y[a : t + 1], None if record.u is None else record.u[a : t + 1])
-            est = self.method.run(self._local(model, record, found, a, t), part, seed=seed)
+            local = self._local(model, record, found, a, t)
+            if shares_costs(self.method, model) and t <= self.memory:
+                assert isinstance(local, Linear)
+                costs = first_costs(local, part, self.memory + 1)
+            est = window_estimate(self.method, local, part, costs, seed)
             x[a + 1 : t + 2] = est.x
             x[a] = est.info.get("x0", x[a])
             s = np.full(model.nx + model.ny, np.nan)
@@ -457,6 +462,33 @@ def first_costs(model: Linear, record: Record, rows: int) -> Array:
     return scaled_costs(count, base.sigma)
 
 
+def shares_costs(method: Estimator, model: Model) -> bool:
+    """Say whether all windows of a method are given the scales of the first full one."""
+    return isinstance(method, BatchLP) and method.objective == "scaled" and isinstance(model, Linear)
+
+
+def window_estimate(
+    method: Estimator, model: Model, part: Record, costs: Array | None, seed: int | None = None
+) -> Estimate:
+    """Estimate one window: the linear program itself where the method is one, else the method's `run`."""
+    if isinstance(method, BatchLP) and isinstance(model, Linear) and method.objective != "log":
+        point = method.point
+        floor, cap = half_width_bounds(model)
+        chain = None if point == "least_squares" else chain_of(model, part, np.ones(len(floor)), floor, cap)
+        if chain is not None and point != "least_squares":
+            answer = solve(chain if costs is None else replace(chain, c=costs), point=point)
+            good, nx = answer.status.good, model.nx
+            return Estimate(
+                part.t, answer.x[1:], None, answer.status, typed(method),
+                q=answer.s[:nx] if good else None, r=answer.s[nx:] if good else None, names=model.names.x,
+                info={
+                    "iterations": answer.iterations, "solver": answer.by, "objective": answer.objective,
+                    "x0": answer.x[0],
+                },
+            )  # fmt: skip
+    return method.run(model, part, seed=seed)
+
+
 def _meet(box: Box, other: Box) -> Box:
     """Return the intersection; the first box where they do not meet."""
     lo, hi = np.maximum(box.lo, other.lo), np.minimum(box.hi, other.hi)
@@ -642,25 +674,14 @@ class _Live:
         )
 
     def _solve(self, model: Model, part: Record) -> Estimate:
-        """Estimate one window: the linear program itself where it is known, else the method's `run`."""
-        method = self.window.method
-        if isinstance(method, BatchLP) and isinstance(model, Linear) and method.objective != "log":
-            point = method.point
-            floor, cap = half_width_bounds(model)
-            chain = None if point == "least_squares" else chain_of(model, part, np.ones(len(floor)), floor, cap)
-            if chain is not None and point != "least_squares":
-                costs = self.costs
-                if method.objective == "scaled" and costs is None:
-                    costs = first_costs(model, part, self.window.memory + 1)
-                    self.costs = costs if self.pushed > self.window.memory else None
-                answer = solve(chain if costs is None else replace(chain, c=costs), point=point)
-                good, nx = answer.status.good, model.nx
-                return Estimate(
-                    part.t, answer.x[1:], None, answer.status, self.method,
-                    q=answer.s[:nx] if good else None, r=answer.s[nx:] if good else None, names=model.names.x,
-                    info={"iterations": answer.iterations, "solver": answer.by, "objective": answer.objective},
-                )  # fmt: skip
-        return method.run(model, part)
+        """Estimate one window with the scales of the first full one."""
+        memory, method = self.window.memory, self.window.method
+        costs = self.costs
+        if costs is None and shares_costs(method, model):
+            assert isinstance(model, Linear)
+            costs = first_costs(model, part, memory + 1)
+            self.costs = costs if self.pushed > memory else None
+        return window_estimate(method, model, part, costs)
 
     def snapshot(self) -> bytes:
         """Return the rows held, as bytes."""
