@@ -58,14 +58,8 @@ def agreement(problems=200):
         nx, ny, T = int(rng.integers(1, 5)), int(rng.integers(1, 4)), int(rng.integers(5, 40))
         A = rng.normal(size=(nx, nx))
         A *= 0.95 / max(np.abs(np.linalg.eigvals(A)))
-        true = hw.Linear(
-            A,
-            None,
-            rng.normal(size=(ny, nx)),
-            hw.Uniform(rng.uniform(0.05, 0.3, nx)),
-            hw.Uniform(0.3),
-            hw.Box([-1] * nx, [1] * nx),
-        )
+        w = hw.Uniform(rng.uniform(0.05, 0.3, nx))
+        true = hw.Linear(A, None, rng.normal(size=(ny, nx)), w, hw.Uniform(0.3), hw.Box([-1] * nx, [1] * nx))
         _, record = hw.simulate(true, None, T=T, seed=seed)
         y = record.y.copy()
         y[rng.random(y.shape) < 0.2] = np.nan
@@ -78,9 +72,7 @@ def agreement(problems=200):
         if one.status is hw.Status.OK and two.status is hw.Status.OK:
             a, b = one.info["objective"], two.info["objective"]
             worst = max(worst, abs(a - b) / max(abs(b), 1e-3))
-    print(
-        f"objective, PIQP against HiGHS on {problems} random problems: largest relative difference {worst:.1e}; {status}"
-    )
+    print(f"objective, PIQP against HiGHS on {problems} problems: largest relative difference {worst:.1e}; {status}")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ namespace nb = nanobind;
 void bind_kalman(nb::module_& m);
 void bind_tape(nb::module_& m);
 void bind_nonlinear(nb::module_& m);
+void bind_loss(nb::module_& m);
 void bind_lp(nb::module_& m);
 void bind_chain(nb::module_& m);
 
@@ -20,6 +21,7 @@ NB_MODULE(_core, m) {
     bind_kalman(m);
     bind_tape(m);
     bind_nonlinear(m);
+    bind_loss(m);
     bind_lp(m);
     bind_chain(m);
 }

@@ -58,6 +58,7 @@ struct Dim<0> {
 enum class Op { set, add, sub };
 
 constexpr double eps = 2.220446049250313e-16;
+constexpr double smallest = 2.2250738585072014e-308;  // normal number
 constexpr double log_2pi = 1.8378770664093454836;
 
 inline double max2(double a, double b) { return a > b ? a : b; }
@@ -304,6 +305,32 @@ inline void congruence(M m, N n, const double* A, const double* At, const double
 template <class N>
 inline double tiny_pivot(N n) { return 16.0 * eps * (n + 1); }
 
+// One column of `ldl` for a fixed size, all in registers: entries stored one by one and loaded again in pairs would stall.
+template <int N, int J>
+[[gnu::always_inline]] inline void ldl_column(const double* S, double (&l)[N][N], double (&p)[N], double (&r)[N],
+                                              int& vanished, bool& bad) {
+    if constexpr (J < N) {
+        constexpr double tol = 16.0 * eps * (N + 1);
+        const double sjj = S[J * N + J];
+        double s = sjj, lp[N];
+        for (int k = 0; k < J; k++) {
+            lp[k] = l[J][k] * p[k];
+            s -= l[J][k] * lp[k];
+        }
+        const bool fine = s > tol * sjj && s >= smallest && finite(s);
+        p[J] = fine ? s : 0.0;
+        r[J] = fine ? 1.0 / s : 0.0;
+        vanished += !fine;
+        bad = bad || (!fine && (!(s >= -1e3 * tol * std::fabs(sjj)) || !finite(s)));
+        for (int i = J + 1; i < N; i++) {
+            double v = S[i * N + J];
+            for (int k = 0; k < J; k++) v -= l[i][k] * lp[k];
+            l[i][J] = v * r[J];
+        }
+        ldl_column<N, J + 1>(S, l, p, r, vanished, bad);
+    }
+}
+
 // S (n,n) = L D L', L unit lower (n,n; only below the diagonal is written), d (n) pivots, di (n) their reciprocals.
 // Returns how many pivots vanished (d = di = 0 there), or -1 if one is clearly negative or not finite (taken as
 // vanished too, so that what follows stays finite).
@@ -311,23 +338,34 @@ template <class N>
 inline int ldl(N n, const double* S, double* L, double* d, double* di) {
     int vanished = 0;
     bool bad = false;
-    const double tol = tiny_pivot(n);
-    for (int j = 0; j < n; j++) {
-        const double sjj = S[j * n + j];
-        double p = sjj;
-        for (int k = 0; k < j; k++) p -= L[j * n + k] * L[j * n + k] * d[k];
-        if (p > tol * sjj && p >= 1e-300 && finite(p)) {
-            d[j] = p;
-            di[j] = 1.0 / p;
-        } else {
-            bad = bad || !(p >= -1e3 * tol * std::fabs(sjj)) || !finite(p);
-            vanished++;
-            d[j] = di[j] = 0.0;
+    if constexpr (N::fixed) {
+        constexpr int c = N::cap;
+        double l[c][c], p[c], r[c];
+        ldl_column<c, 0>(S, l, p, r, vanished, bad);
+        for (int i = 0; i < c; i++) {
+            d[i] = p[i];
+            di[i] = r[i];
+            for (int j = 0; j < i; j++) L[i * c + j] = l[i][j];
         }
-        for (int i = j + 1; i < n; i++) {
-            double s = S[i * n + j];
-            for (int k = 0; k < j; k++) s -= L[i * n + k] * (L[j * n + k] * d[k]);
-            L[i * n + j] = s * di[j];
+    } else {
+        const double tol = tiny_pivot(n);
+        for (int j = 0; j < n; j++) {
+            const double sjj = S[j * n + j];
+            double p = sjj;
+            for (int k = 0; k < j; k++) p -= L[j * n + k] * L[j * n + k] * d[k];
+            if (p > tol * sjj && p >= smallest && finite(p)) {
+                d[j] = p;
+                di[j] = 1.0 / p;
+            } else {
+                bad = bad || !(p >= -1e3 * tol * std::fabs(sjj)) || !finite(p);
+                vanished++;
+                d[j] = di[j] = 0.0;
+            }
+            for (int i = j + 1; i < n; i++) {
+                double s = S[i * n + j];
+                for (int k = 0; k < j; k++) s -= L[i * n + k] * (L[j * n + k] * d[k]);
+                L[i * n + j] = s * di[j];
+            }
         }
     }
     return bad ? -1 : vanished;
@@ -372,7 +410,7 @@ inline int cholesky(N n, const double* S, double* L, double* li) {
         const double sjj = S[j * n + j];
         double p = sjj;
         for (int k = 0; k < j; k++) p -= L[j * n + k] * L[j * n + k];
-        if (p > tol * sjj && p >= 1e-300 && finite(p)) {
+        if (p > tol * sjj && p >= smallest && finite(p)) {
             L[j * n + j] = std::sqrt(p);
             li[j] = 1.0 / L[j * n + j];
         } else {

@@ -110,6 +110,8 @@ CASES = _cases()
 def _settings():
     """Every exported estimator with its defaults, and the variants that a family adds."""
     variants = {
+        "GPB": [{"depth": 3, "smooth": True}],
+        "BKF1": [{"smooth": True}],
         "KalmanSmoother": [{"lag": 4}],
         "ExtendedKalman": [{"smooth": True}],
         "UnscentedKalman": [{"smooth": True}],

@@ -169,7 +169,7 @@ def test_estimate_to_standard_output_and_as_json(files, capsys):
         (MODEL + '\n[method]\nname = "KalmanFlter"\n', 3, "hint: KalmanFilter"),
         (MODEL + "\n[method]\nsteady = true\n", 3, "no `method` is named"),
         (MODEL + '\n[method]\nname = "KalmanFilter"\nsted = true\n', 3, "unknown key `sted`"),
-        (MODEL.replace("e = { gaussian = 0.04 }", "e = { uniform = 0.2 }"), 2, "Refused: "),
+        ("method = 'KalmanFilter'" + MODEL.replace("{ gaussian = 0.04 }", "{ uniform = 0.2 }"), 2, "Refused: "),
     ],
 )
 def test_estimate_says_what_is_wrong(text, code, words, files, tmp_path, capsys):

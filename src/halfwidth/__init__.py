@@ -24,6 +24,8 @@ _HOME: dict[str, str] = {
     "Box": "spread",
     "Normal": "spread",
     "Cloud": "spread",
+    "Bernoulli": "loss",
+    "Markov": "loss",
     "Linear": "model",
     "Nonlinear": "model",
     "Record": "record",
@@ -76,8 +78,17 @@ if TYPE_CHECKING:
     from halfwidth.forecast import forecast as forecast
     from halfwidth.learn import Learned as Learned
     from halfwidth.learn import learn as learn
+    from halfwidth.loss import Bernoulli as Bernoulli
+    from halfwidth.loss import Markov as Markov
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.methods.loss import BKF1 as BKF1
+    from halfwidth.methods.loss import BKF2 as BKF2
+    from halfwidth.methods.loss import GPB as GPB
+    from halfwidth.methods.loss import RBPF as RBPF
+    from halfwidth.methods.loss import BeamSearch as BeamSearch
+    from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
+    from halfwidth.methods.loss import Runnalls as Runnalls
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter

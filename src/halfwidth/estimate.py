@@ -17,6 +17,7 @@ from halfwidth.result import Estimate
 DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("KalmanSmoother", {}),
     ("UnscentedKalman", {"smooth": True}),
+    ("GPB", {"depth": 5, "smooth": True}),
     ("BatchLP", {}),
     ("ParticleFilter", {}),
 )
@@ -146,10 +147,11 @@ def _steps(model: Linear, record: Record) -> None:
     if len(record) < 3 or not model.A.constant:
         return
     step = np.diff(record.t)
-    middle = float(np.median(step))
-    if np.ptp(step) > 0.5 * middle:
+    lo, hi = float(step.min()), float(step.max())
+    # the median is not below the least step, so it is needed only where that one would warn
+    if hi - lo > 0.5 * lo and hi - lo > 0.5 * float(np.median(step)):
         warnings.warn(
-            f"time steps run from {step.min():.3g} to {step.max():.3g} s but `A` is constant, so each row counts"
+            f"time steps run from {lo:.3g} to {hi:.3g} s but `A` is constant, so each row counts"
             " as one step; give `A` (and the noise) as a function of dt, or insert the missing rows",
             DataQualityWarning,
             stacklevel=3,

@@ -113,7 +113,7 @@ def learn(
     --------
     >>> import halfwidth as hw
     >>> walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(1.0), hw.Gaussian(4.0), hw.Normal([0.0], 1.0))
-    >>> _, record = hw.simulate(walk, T=500, seed=1)
+    >>> _, record = hw.simulate(walk, T=5000, seed=1)
     >>> guess = hw.Linear([[1]], None, [[1]], hw.Gaussian(0.1), hw.Gaussian(0.1), walk.x0)
     >>> hw.learn(guess, record).check().model.e.cov().single.round(0)
     array([[4.]])
@@ -281,6 +281,7 @@ class _Problem:
         history: list[float] = []
         status, message = Status.STALLED, f"the likelihood still rose after {iterations} iterations"
         best = model
+        trail = [model]
         found = self.expect(model)
         while len(history) < iterations:
             if not found["ok"]:
@@ -294,11 +295,50 @@ class _Problem:
                 break
             model = self.maximise(model, found)
             found = self.expect(model)
+            trail.append(model)
+            if len(trail) == 3:
+                trial = self.extrapolate(trail)
+                there = None if trial is None else self.expect(trial)
+                if trial is not None and there is not None and there["ok"] and there["loglik"] > found["loglik"]:
+                    model, found = trial, there
+                trail = [model]
         if found["ok"] and (not history or found["loglik"] >= history[-1]):
             best = model
         loglik = max(found["loglik"], history[-1]) if found["ok"] else history[-1] if history else float("-inf")
         info = {"message": message, "iterations": len(history), "n_seen": int(self.seen.sum())}
         return Learned(best, loglik, tuple(history), status, info)
+
+    def extrapolate(self, trail: list[Linear]) -> Linear | None:
+        """Return a long step along three models in a row, None where there is none.
+
+        The squared extrapolation of Varadhan and Roland (2008, Scand. J. Stat. 35(2)), on Cholesky factors and
+        logarithms so that covariances stay positive; the caller keeps it only if the likelihood rises.
+        """
+        parts = [name for name in ("Q", "R") if name in self.what]
+        if set(self.what) - set(parts):
+            return None
+        try:
+            maps = [_Map(self.kinds[name], _covariance(trail[0], name)) for name in parts]
+            p = [
+                np.concatenate([m.numbers(_covariance(at, n), self) for m, n in zip(maps, parts, strict=True)])
+                for at in trail
+            ]
+        except np.linalg.LinAlgError:
+            return None
+        r, v = p[1] - p[0], p[2] - 2 * p[1] + p[0]
+        length = float(np.linalg.norm(v))
+        if length == 0.0:
+            return None
+        a = max(1.0, float(np.linalg.norm(r)) / length)
+        far = p[0] + 2 * a * r + a**2 * v
+        if not np.isfinite(far).all() or a == 1.0:
+            return None
+        new: dict[str, Any] = {}
+        k = 0
+        for m, name in zip(maps, parts, strict=True):
+            new["w" if name == "Q" else "e"] = Gaussian(m.matrix(far[k : k + m.size]))
+            k += m.size
+        return dataclasses.replace(trail[2], **new)
 
     def maximise(self, model: Linear, s: dict[str, Any]) -> Linear:
         """Return the next model from the expected sums."""
@@ -441,6 +481,10 @@ def _regression(Wz: Array, Z: Array, Q: Array, mask: Any, lo: Array, hi: Array) 
     return step
 
 
+def _covariance(model: Linear, name: str) -> Varying:
+    return (model.w if name == "Q" else model.e).cov()
+
+
 def _scale_of(stack: Array, sums: Array, rows: Array) -> float:
     """Return the multiple of the given covariances that maximises the expected likelihood."""
     inverse = np.linalg.pinv(stack, hermitian=True)
@@ -478,12 +522,25 @@ class _Map:
             self.size = 1
 
     def start(self) -> Array:
+        """Return the numbers of the covariance it was made from."""
         if self.kind == "full":
-            p = self.L[self.row, self.column] / self.unit[self.row]
-            diagonal = self.row == self.column
-            p[diagonal] = np.log(p[diagonal])
-            return np.asarray(p)
+            return self._of_factor(np.asarray(self.L, dtype=np.float64))
         return np.log(self.d) if self.kind == "diagonal" else np.zeros(1)
+
+    def numbers(self, matrix: Varying, problem: _Problem) -> Array:
+        """Return the numbers of another covariance of the same structure."""
+        if self.kind == "full":
+            return self._of_factor(np.asarray(np.linalg.cholesky(matrix.single), dtype=np.float64))
+        if self.kind == "diagonal":
+            return np.asarray(np.log(np.maximum(np.diagonal(matrix.single), 1e-300)))
+        size = [max(float(np.trace(problem.stack(m)[0])), 1e-300) for m in (matrix, self.now)]
+        return np.array([np.log(size[0] / size[1])])
+
+    def _of_factor(self, L: Array) -> Array:
+        p = L[self.row, self.column] / self.unit[self.row]
+        diagonal = self.row == self.column
+        p[diagonal] = np.log(p[diagonal])
+        return np.asarray(p)
 
     def factor(self, p: Array) -> Array:
         L = np.zeros((self.n, self.n))

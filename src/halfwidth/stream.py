@@ -22,7 +22,7 @@ from halfwidth.estimate import choose
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model
 from halfwidth.noise import Gaussian
-from halfwidth.result import Estimate, Newest, Status
+from halfwidth.result import Estimate, Newest
 from halfwidth.spread import Normal
 
 _MAGIC = b"HWSTREAM"
@@ -103,13 +103,7 @@ def stream(model: Model, method: Any = None, *, t: float = 0.0) -> Stream:
     >>> float(live.push(1.0).x[0, 0].round(3)), float(live.push(None).x[0, 0].round(3))
     (0.667, 0.667)
     """
-    if method is None:
-        method = methods.load("KalmanFilter")()
-        reason = method.refuses(model)
-        if reason is not None:
-            message, hint = hinted(reason)
-            raise Refused(f"no default method runs on a stream of this model; {message}", hint=hint)
-    method = choose(model, method)
+    method = _default(model) if method is None else choose(model, method)
     if not math.isfinite(t):
         raise BadValue(f"`t` is {t!r}, a finite time in seconds was expected")
     if hasattr(method, "stream"):
@@ -117,6 +111,20 @@ def stream(model: Model, method: Any = None, *, t: float = 0.0) -> Stream:
     if hasattr(method, "step"):
         return Stream(model, method, _Stepped(model, method, float(t)))
     raise Refused(f"`{typed(method)}` has no online form", hint="KalmanFilter(), or Window(method) for a batch method")
+
+
+def _default(model: Model) -> Any:
+    """Return the first recursive method that takes the model."""
+    reasons = []
+    for name in ("KalmanFilter", "UnscentedKalman", "GPB"):
+        if name in methods.ESTIMATORS:
+            method = methods.load(name)()
+            reason = method.refuses(model)
+            if reason is None:
+                return method
+            reasons.append(reason)
+    message, hint = hinted(reasons[0])
+    raise Refused(f"no default method runs on a stream of this model; {message}", hint=hint)
 
 
 def resume(snapshot: bytes, model: Model | None = None) -> Stream:
@@ -317,6 +325,3 @@ def _model_from_json(plain: dict[str, Any]) -> Linear:
         dt=plain["dt"],
         names=plain["names"],
     )
-
-
-__all__ = ["Status", "Stream", "resume", "stream"]

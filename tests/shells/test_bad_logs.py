@@ -123,7 +123,7 @@ def gz(raw, change=lambda packed: packed):
     def make(folder):
         path = folder / "log.csv.gz"
         content = raw() if callable(raw) else raw
-        path.write_bytes(change(gzip.compress(content, mtime=0)))
+        path.write_bytes(change(gzip.compress(content, compresslevel=6, mtime=0)))
         return str(path)
 
     return make

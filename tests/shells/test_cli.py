@@ -386,8 +386,11 @@ def test_demo(tmp_path, capsys):
     data = json.loads(capsys.readouterr().out)
     assert len(data["tunnels"]) == 3
     assert os.path.exists(data["report"])
+    assert cli.run(["demo", "-o", str(folder), "-q"]) == GOOD  # the same again
+    capsys.readouterr()
+    (folder / "track.gpx").rename(folder / "mine.gpx")
     assert cli.run(["demo", "-o", str(folder)]) == USAGE
-    assert "holds files already" in capsys.readouterr().err
+    assert "holds other files already" in capsys.readouterr().err
 
 
 def test_doctor(capsys):
@@ -410,11 +413,11 @@ def test_progress_shows_on_a_terminal_only(monkeypatch):
     assert shown.getvalue() == ""
     monkeypatch.setenv("TERM", "xterm")
     with commands._working("filling", quiet=False) as progress:
-        progress(3, 12)
+        progress(0.25, "em, 1 s")
         deadline = time.monotonic() + 5
-        while "3/12" not in shown.getvalue() and time.monotonic() < deadline:
+        while "25 %" not in shown.getvalue() and time.monotonic() < deadline:
             time.sleep(0.05)
-    assert "\rfilling 3/12, " in shown.getvalue()
+    assert "\rfilling 25 %, em, 1 s, " in shown.getvalue()
     # what was shown is wiped away
     assert shown.getvalue().endswith("\r")
 

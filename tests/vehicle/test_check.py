@@ -144,7 +144,7 @@ def test_a_log_and_a_table_are_taken_too(tmp_path):
 @pytest.mark.parametrize(
     ("name", "verdict"),
     [
-        ("balzer_dresden_2014_03_26", "ok"),
+        ("balzer_dresden_2014_03_26", "warn"),  # its fixes step aside by 5 m within 0.1 s at t = 28.8 s
         ("driveplotr_nds_drive18", "warn"),
         ("smartloc_berlin_potsdamer_platz", "ok"),
     ],

@@ -313,3 +313,83 @@ def test_half_widths_hold_hidden_fixes_of_real_logs(data, name):
             np.mean(np.abs(true[1] - found[1]) <= track.north_half_m[at]),
         ]
     assert np.mean(inside) > 0.75
+
+
+def test_a_receivers_own_log_is_filled_where_it_pauses():
+    """Nothing at all arrives in the tunnel: rows are added at the rate of the fixes."""
+    t = np.arange(0.0, 120.0)
+    lat, lon = 50 + 1e-4 * t, 14 + 2e-4 * np.sin(t / 30)
+    keep = (t < 50) | (t > 75)
+    track = hw.vehicle.fill(hw.vehicle.Log(t=t[keep], lat_deg=lat[keep], lon_deg=lon[keep]))
+    np.testing.assert_allclose(track.t_s, t)
+    assert np.all((track.quality == "bridged") == ~keep)
+    assert np.abs(track.lat_deg - lat).max() * 111e3 < 1.0
+    assert any("26 rows were added" in message for message in track.messages)
+
+
+def test_a_pause_longer_than_a_minute_is_left_open():
+    t = np.r_[np.arange(0.0, 60.0), np.arange(130.0, 190.0)]
+    track = hw.vehicle.fill(hw.vehicle.Log(t=t, lat_deg=50 + 1e-5 * t, lon_deg=np.full(t.size, 14.0)))
+    np.testing.assert_array_equal(track.t_s, t)
+    assert any("left open" in message for message in track.messages)
+
+
+@pytest.mark.parametrize("jump", [20.0, 1000.0])
+def test_two_stray_fixes_do_not_set_the_noise_of_the_drive(jump):
+    made = drive()
+    lat = np.array(made.log.lat_deg)
+    lat[700:702] += jump / 111e3
+    clean = fill(made.log.without(100, 115))
+    track = sound(fill(dataclasses.replace(made.log, lat_deg=lat).without(100, 115)))
+    assert any("left out: t = 70.0, 70.1 s" in m or "left out: t = 70.0 s" in m for m in track.messages)
+    # 5 Hz nodes: the second fix may not be looked at at all
+    off = made.error(track.t_s, track.lat_deg, track.lon_deg)
+    assert off.max() < 2.0
+    assert track.half_m.max() < 1.2 * clean.half_m.max()
+
+
+def test_any_log_gets_a_track():
+    rng = np.random.default_rng(11)
+    for seed in range(60):
+        made = known(
+            float(rng.choice([3, 10, 40])),
+            rate=float(rng.choice([1, 5, 10])),
+            noise=float(rng.choice([0, 0.2, 3, 50])),
+            speed_noise=float(rng.choice([0, 0.1, 5])),
+            yaw_noise=float(rng.choice([0, 0.01, 0.5])),
+            bias=float(rng.choice([0, 0.02, 1.0])),
+            scale=float(rng.choice([1, 0.5, 3])),
+            fix_every=int(rng.choice([1, 3, 10])),
+            seed=seed,
+        )
+        columns = {
+            name: np.array(getattr(made.log, name))
+            for name in ("t", "lat_deg", "lon_deg", "speed_mps", "yaw_rate_radps")
+        }
+        n = columns["t"].size
+        for name in ("speed_mps", "yaw_rate_radps"):
+            fault = rng.integers(6)
+            if fault == 0:
+                columns[name][:] = NAN
+            elif fault == 1:
+                columns[name][rng.random(n) < 0.97] = NAN
+            elif fault == 2:
+                columns[name][:] = 0
+            elif fault == 3:
+                columns[name][rng.integers(n)] = 1e4
+            elif fault == 4:
+                columns[name] *= -1
+        fault = rng.integers(5)
+        if fault == 0:
+            columns["t"] += np.where(np.arange(n) > n // 2, 1e5, 0)
+        elif fault == 1:
+            columns["t"] **= 1.5
+        elif fault == 2:
+            lost = rng.random(n) < 0.9
+            columns["lat_deg"][lost] = columns["lon_deg"][lost] = NAN
+        elif fault == 3:
+            columns["lat_deg"] += 39.9
+        first = columns["t"][rng.integers(n)]
+        log = Log(**columns).without(first, first + 0.5 * np.ptp(columns["t"]) * rng.random())
+        if log.fixed.any():
+            sound(fill(log))

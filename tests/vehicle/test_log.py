@@ -115,3 +115,12 @@ def test_it_can_be_sent_elsewhere():
 
 def test_its_text_is_short():
     assert repr(a_log(source="a.csv")).startswith("Log('a.csv': 1200 rows, 119.9 s, 600 fixes, streams: ")
+
+
+def test_rows_of_nothing_can_be_added():
+    log = Log(t=[0.0, 1.0, 4.0], lat_deg=[50.0, 50.1, 50.4], lon_deg=[14.0, 14.0, 14.0])
+    more = log.with_rows([2.0, 3.0])
+    assert more.t.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert more.fixed.tolist() == [True, True, False, False, True]
+    with pytest.raises(hw.BadValue):
+        log.with_rows([1.0])

@@ -83,6 +83,13 @@ LAYOUTS = {
         with_columns(lat=("lat_deg", lambda v: np.round(v * 1e7)), lon=("lon_deg", lambda v: np.round(v * 1e7))),
         {"digits": 12},
     ),
+    "semicircles": (
+        with_columns(
+            position_lat=("lat_deg", lambda v: np.round(v * 2**31 / 180)),
+            position_long=("lon_deg", lambda v: np.round(v * 2**31 / 180)),
+        ),
+        {"digits": 12},
+    ),
     "degrees and minutes": (
         with_columns(
             lat=("lat_deg", lambda v: np.floor(v) * 100 + v % 1 * 60),
@@ -106,6 +113,10 @@ LAYOUTS = {
         {},
     ),
     "time of day past midnight": (with_columns(utc_time=("t_s", clock)), {}),
+    "dates with names of months": (
+        with_columns(**{"Device Time": ("t_s", lambda v: [f"01-May-2024 {s[11:]}" for s in iso(v, "")])}),
+        {},
+    ),
     "date and time apart": (
         {"date": ["2024-05-01"] * 1200} | with_columns(time=("t_s", lambda v: clock(v, 3600.0))),
         {},
@@ -154,6 +165,9 @@ def test_a_log_without_dates_has_no_absolute_time_and_keeps_its_own_zero(tmp_pat
     assert log.t[0] == 100
     iso_log = hw.vehicle.read(save(tmp_path / "iso.csv", LAYOUTS["ISO 8601"][0]))
     assert iso_log.epoch_s == 1_714_564_800
+    assert "time stamps without a zone taken as UTC" not in iso_log.notes
+    naive = hw.vehicle.read(save(tmp_path / "naive.csv", LAYOUTS["ISO 8601 with a blank"][0]))
+    assert "time stamps without a zone taken as UTC" in naive.notes
 
 
 def test_comments_titles_units_and_trailing_delimiters(tmp_path):
@@ -335,6 +349,7 @@ def test_without_repair_stated_units_stand(tmp_path):
         ("speed_m_s", "speed", "m/s"), ("vehicle_speed_kph", "speed", "km/h"), ("v [m/s]", "speed", "m/s"),
         ("yaw_rate_deg_s", "yaw_rate", "deg/s"), ("gyroZ[rad/s]", "yaw_rate", "rad/s"), ("wz", "yaw_rate", None),
         ("angular_velocity.z", "yaw_rate", None), ("ax_mps2", "ax", "m/s2"), ("accX (g)", "ax", "g"),
+        ("field.header.stamp", "time", None), ("LOCATION Latitude : ", "lat", None), ("enhanced_speed", "speed", None),
         ("lat_acc", "ay", None), ("long_acc", "ax", None), ("course_over_ground", "azimuth", None),
         ("heading_rad", "azimuth", "rad"), ("altitude_ft", "alt", "ft"), ("fix_quality", "valid", None),
     ],
@@ -389,6 +404,22 @@ def test_a_standing_car_tells_nothing_and_nothing_is_changed(tmp_path):
     log = hw.vehicle.read(save(tmp_path / "log.csv", still))
     assert log.fixed.all()
     assert len(log.notes) == 1
+
+
+def test_a_speed_of_a_wrong_scale_on_a_straight_road_swaps_nothing(tmp_path):
+    columns = drive(lat0=40.0, east_west=True)
+    columns["speed_mps"] = columns["speed_mps"] / np.cos(np.radians(40.0))
+    del columns["azimuth_rad"]
+    log = hw.vehicle.read(save(tmp_path / "log.csv", columns))
+    np.testing.assert_allclose(log.lat_deg, columns["lat_deg"], atol=1e-7)
+
+
+def test_swapped_columns_are_seen_without_an_azimuth(tmp_path):
+    columns = drive()
+    columns["lat_deg"], columns["lon_deg"] = columns["lon_deg"], columns["lat_deg"]
+    del columns["azimuth_rad"]
+    log = hw.vehicle.read(save(tmp_path / "log.csv", columns))
+    np.testing.assert_allclose(log.lat_deg, columns["lon_deg"], atol=1e-7)
 
 
 def test_streams_one_after_the_other_are_sorted_together(tmp_path):

@@ -7,8 +7,10 @@ import io
 import json
 import re
 import sys
+import threading
 import time
 from html.parser import HTMLParser
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
 
 import numpy as np
@@ -119,7 +121,7 @@ def test_one_gap_is_singular_and_no_gap_says_so():
     [
         (
             "credible",
-            "90 % credible interval: where a fix would be, east and north each lie inside with probability 90 %",
+            "90 % credible interval: east and north each lie inside with probability 90 %",
         ),
         ("proven", "proven bound: it holds as long as the noise stays within"),
         ("none", "an indication of size: no probability is claimed"),
@@ -345,6 +347,7 @@ def test_limits_and_legend_cover_the_half_widths():
     assert picture.legend_of(limits) == ["below 0.5 m", "0.5 to 1 m", "1 to 2 m", "above 2 m"]
     assert len(picture.limits_of(np.array([0.01, 5000.0]))) == 5
     assert picture.limits_of(np.array([1.5, 1.6])) == []
+    assert picture.limits_of(np.array([1.9, 3.35])) == [2, 2.5, 3]
     assert [picture.colour_of(k, 4) for k in range(4)] == [0, 2, 3, 5]
 
 
@@ -539,6 +542,34 @@ def test_policy_stops_what_gets_in_anyway(browser, drive):
 
 
 @needs_browser
+def test_page_asks_nothing_of_a_server_either(browser, drive):
+    """Served over HTTP, where browsers look for an icon beside the page."""
+    asked = []
+
+    class Server(SimpleHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.directory = str(drive[1].parent)
+            super().do_GET()
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Server) as server:
+        serving = threading.Thread(target=server.serve_forever)
+        serving.start()
+        browser.events.clear()
+        browser("Page.navigate", url=f"http://127.0.0.1:{server.server_port}/{drive[1].name}")
+        browser.settle(0.5)
+        complaints = browser.complaints()
+        server.shutdown()
+        serving.join()
+    assert asked == [f"/{drive[1].name}"]
+    assert complaints == []
+    assert browser.run("document.documentElement.dataset.ready") == "yes"
+
+
+@needs_browser
 def test_scale_bar_is_true(browser, drive):
     browser.open(drive[1])
     for _ in range(3):
@@ -678,6 +709,20 @@ def test_showing_a_gap_looks_closer_in_map_and_charts(browser, drive):
     assert browser.run("document.getElementById('l-speed').getAttribute('d')") == line
     assert browser.run(BOX) == pytest.approx(whole)
     assert browser.complaints() == []
+
+
+@needs_browser
+def test_tip_stays_on_the_map(browser, drive):
+    browser.open(drive[1], width=360, height=800)
+    for row in range(0, 6000, 400):
+        browser.run(
+            f"(s => {{ s.value = {row}; s.dispatchEvent(new Event('input')); }})(document.getElementById('when'))"
+        )
+        inside = browser.run(
+            "(([a, b]) => a.left >= b.left && a.right <= b.right && a.top >= b.top && a.bottom <= b.bottom)"
+            "(['tip', 'map'].map(id => document.getElementById(id).getBoundingClientRect()))"
+        )
+        assert inside, row
 
 
 @needs_browser

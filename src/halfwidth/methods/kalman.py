@@ -227,10 +227,13 @@ def _run(mode: str, method: Any, model: Linear, records: Sequence[Record], wante
         return []
     one = len(records) == 1
     first, lengths = records[0], [len(r) for r in records]
-    t = first.t if one else np.concatenate([r.t for r in records])
     y = first.y if one else np.concatenate([r.y for r in records])
     seen = first.seen if one else np.concatenate([r.seen for r in records])
-    dt = first.steps(model.dt) if one else np.concatenate([r.steps(model.dt) for r in records])
+    if one or all(matrix.constant for matrix in (*model.matrices.values(), model.w.cov(), model.e.cov())):
+        t, dt = first.t, first.steps(model.dt)
+    else:
+        t = np.concatenate([r.t for r in records])
+        dt = np.concatenate([r.steps(model.dt) for r in records])
     u = None
     if model.nu:
         u = first.u if one else np.concatenate([r.u for r in records if r.u is not None])

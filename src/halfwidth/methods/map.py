@@ -133,10 +133,10 @@ class BatchLP:
     --------
     >>> import halfwidth as hw
     >>> unknown = hw.Uniform.unknown(at_most=10.0)
-    >>> walk = hw.Linear([[1]], None, [[1]], unknown, unknown, None)
-    >>> est = hw.estimate(walk, hw.Record([0, 1, 2, 3], [0.0, 0.4, None, 1.2]), hw.BatchLP())
+    >>> car = hw.Linear([[1, 1], [0, 1]], None, [[1, 0]], unknown, unknown, None, names=["p", "v"])
+    >>> est = hw.estimate(car, hw.Record([0, 1, 2, 3, 4], [1.0, 1.5, None, 2.5, 3.0]), hw.BatchLP())
     >>> est.x[:, 0].round(3)
-    array([0. , 0.4, 0.8, 1.2])
+    array([1. , 1.5, 2. , 2.5, 3. ])
     """
 
     objective: Literal["scaled", "paper", "log"] = "scaled"

@@ -1,7 +1,7 @@
 """The source papers' tables beside ours: `tables(number)` returns them as plain values, `text` prints them.
 
-Every paper is one module with ``tables(*, quick=False) -> tuple[Table, ...]`` and ``figures(folder)``. Reference
-numbers are those printed in the papers; notes say what cannot match and why.
+Every paper is one module with ``tables(*, quick=False) -> tuple[Table, ...]`` and ``figures(folder)``. The numbers of
+reference are those printed in the papers; notes say what cannot match and why.
 """
 
 import importlib
@@ -11,7 +11,7 @@ from typing import Any
 from halfwidth.errors import BadValue
 
 #: Papers that are reproduced here, by number.
-PAPERS: dict[str, str] = {"000": "paper000", "003": "paper003"}
+PAPERS: dict[str, str] = {"000": "paper000", "001": "paper001", "003": "paper003"}
 
 
 @dataclass(frozen=True)

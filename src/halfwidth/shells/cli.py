@@ -49,9 +49,10 @@ def run(args: Sequence[str]) -> int:
             raise
         _say("the command line needs typer, which is not installed\nhint: pip install 'halfwidth[app]'")
         return USAGE
+    before: Any = None
     with suppress(ValueError):  # not the main thread: leave signals to whoever owns them
         # so that temporary files are cleared away when asked to stop
-        signal.signal(signal.SIGTERM, _terminate)
+        before = signal.signal(signal.SIGTERM, _terminate)
     try:
         code = call(list(args))
         sys.stdout.flush()
@@ -71,6 +72,9 @@ def run(args: Sequence[str]) -> int:
         return _system(error, args)
     except Exception as error:
         return _internal(error, args)
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
     return code
 
 

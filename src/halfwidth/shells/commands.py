@@ -9,6 +9,7 @@ import os
 import shlex
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Annotated, Any
 
 import typer
 
-from halfwidth.errors import BadValue
+from halfwidth.errors import BadValue, DataQualityWarning
 from halfwidth.shells import cli
 
 SCHEMA_VERSION = 1
@@ -38,11 +39,19 @@ app = typer.Typer(
 )
 
 
+def _warned(message: Warning | str, category: type[Warning], *_where: object, **_more: object) -> None:
+    """Say a warning about the data as a note; what libraries warn of is no news to a user."""
+    if issubclass(category, DataQualityWarning):
+        print(f"note: {message}", file=sys.stderr)
+
+
 def call(args: list[str]) -> int:
     """Run the commands on these arguments and give the exit code."""
     command = typer.main.get_command(app)
     try:
-        code = command.main(args=args, prog_name="halfwidth", standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = _warned
+            code = command.main(args=args, prog_name="halfwidth", standalone_mode=False)
     except typer.Abort:
         raise KeyboardInterrupt from None
     except _ClickError as error:
@@ -284,8 +293,12 @@ def demo(
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
         raise _usage(f"`{output}` is a file, a folder is expected", "-o FOLDER")
-    if folder.is_dir() and any(folder.iterdir()) and not force:
-        raise _usage(f"`{output}` holds files already", "--force to overwrite them, or -o FOLDER for another place")
+    held = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    # a demonstration is made anew, so that the same command can be typed twice; anything else is kept
+    if held and held != {"drive.csv", "track.gpx", "report.html"} and not force:
+        raise _usage(
+            f"`{output}` holds other files already", "--force to overwrite them, or -o FOLDER for another place"
+        )
     with _working("demo", quiet or no_progress):
         result = drive.run(folder, seed=seed)
     if json_:
@@ -654,7 +667,7 @@ def _doctor_text(found: Mapping[str, Any]) -> str:
 
 
 @contextmanager
-def _working(what: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+def _working(what: str, quiet: bool) -> Iterator[Callable[[float, str], None] | None]:
     """Show progress on a terminal while something runs: a clock, or a share where it is known."""
     terminal = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
     if quiet or not terminal:
@@ -670,8 +683,8 @@ def _working(what: str, quiet: bool) -> Iterator[Callable[[int, int], None] | No
 
     latest = [""]
 
-    def progress(n: int, total: int) -> None:
-        latest[0] = f"{n}/{total}, "
+    def progress(share: float, words: str) -> None:
+        latest[0] = f"{100 * share:.0f} %, {words}, "
 
     def tick() -> None:
         # short work shows nothing at all

@@ -16,8 +16,12 @@ of the rows whose combination z'G x stays below what the rows demand wherever x 
 where no solver hands one over, the multipliers of the elastic program (least total violation of
 the rows, always solvable, judged the same way) are one. It is **unbounded** only with a feasible
 point and a direction of descent that no row stops. Otherwise the next solver is asked, and in the
-end the verdict says `FAILED`, or `REDUCED` for a point that is good to 1e-6 only. So a sloppy,
+end the verdict says `FAILED`, or `REDUCED` for a point that is good to 1e-5 only. So a sloppy,
 broken or lying solver can cost time, never a wrong answer.
+
+A point that is nearly optimal is polished first: the equations of the rows and boxes that look
+active are solved, and the better point is kept. A small program whose optimum is too flat to
+polish gets the opinion of the next solver, too.
 
 Adding a solver: write a function from a `Program` to a `Claim` and put ``Solver(name, function)``
 into the tuple given to `solve`. Its multipliers follow the sign above: z > 0 prices a row at its
@@ -42,7 +46,7 @@ from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 
 TOLERANCE = 1e-7
-REDUCED = 1e-6
+REDUCED = 1e-5
 
 # Below this share of its own terms, or of the balanced cost scale, the objective is compared absolutely.
 _FLOOR, _TINY = 1e-6, 1e-9
@@ -52,6 +56,8 @@ _SMALL = 1e-4
 _SHARP, _SMALL_ROWS = 1e-10, 3000
 # A point this close to optimal is worth polishing.
 _NEAR = 1e-3
+# Where a column has no box, an optimum up to this size is excluded by the reduced costs.
+_FAR = 1e5
 # A Farkas certificate excludes every x within this many times the program's own size.
 _REACH = 1e12
 
@@ -258,7 +264,7 @@ def solve(program: Program, solvers: Sequence[Solver] | None = None) -> Solution
     scaled = _Scaled(program)
     notes: list[str] = []
     found = scaled.ask(solvers, notes)
-    if found.verdict in (Verdict.FAILED, Verdict.REDUCED):
+    if found.verdict is Verdict.FAILED:
         proof = _elastic_proof(scaled.program, solvers, notes)
         found = found if proof is None else proof
     x = None if found.x is None else np.clip(scaled.x * found.x, program.lo, program.hi)
@@ -304,7 +310,9 @@ def judge(program: Program, x: Array, z: Array) -> tuple[Array, Array, Check]:
         price = _price(z, program.row_lo, program.row_hi) + _price(d, program.lo, program.hi)
         dual = float(price - 0.5 * x @ Px)
         unit = max(_TINY, program.floor, _FLOOR * float(np.abs(program.c) @ np.abs(x))) + abs(primal)
-        off = abs(primal - dual) + float(broken @ np.abs(z)) + float(wrong @ np.abs(x))
+        # What violations are worth to the objective; the optimum may lie far from x along a column without a box.
+        worth = float(broken @ np.abs(z)) + float(wrong @ np.abs(x)) + _FAR * _largest(wrong)
+        off = abs(primal - dual) + worth
         slack = max(
             _largest_product(z, value, program.row_lo, program.row_hi),
             _largest_product(d, x, program.lo, program.hi),
@@ -378,36 +386,43 @@ def certifies(program: Program, z: Array) -> bool:
 
 
 def _proof(program: Program, z: Array) -> Array | None:
-    """Return multipliers that certify infeasibility, z itself or z cleaned of its rounding, or None.
+    """Return multipliers that certify infeasibility, z itself or z cleaned of its rounding, or None."""
+    if certifies(program, z):
+        return z
+    top = _largest(np.abs(z))
+    if not 0.0 < top < np.inf:
+        return None
+    exact = _cleaned(program, np.where(np.abs(z) > 1e-9 * top, z, 0.0) / top, np.zeros(program.c.size))
+    return exact if exact is not None and certifies(program, exact) else None
 
-    An interior point leaves ``G'z`` a little off 0 where x has no box. The correction of least relative size, found by
-    least squares with the weights z^2, keeps the signs.
+
+def _cleaned(program: Program, z: Array, slope: Array) -> Array | None:
+    """Return multipliers with ``G'z = slope`` to rounding in columns without a box, or None.
+
+    An interior point leaves ``G'z`` a little off there. The correction of least relative size, found by least squares
+    with the weights z^2, keeps the signs.
     """
     import scipy.sparse as sp
     from scipy.sparse.linalg import splu
 
-    if certifies(program, z):
-        return z
-    z = _signed(program, z)
-    top = _largest(np.abs(z))
     free = np.flatnonzero(np.isneginf(program.lo) | np.isposinf(program.hi))
-    if not 0.0 < top < np.inf or free.size == 0:
+    if free.size == 0:
         return None
-    z = np.where(np.abs(z) > 1e-9 * top, z, 0.0) / top
-    G = program.G[:, free]
-    half = np.isfinite(program.lo[free]) | np.isfinite(program.hi[free])
-    for _ in range(3):
-        v = G.T @ z
-        # A side with a box may be priced: only the part that meets no box has to vanish.
-        allowed = half & (np.where(np.isfinite(program.lo[free]), -v, v) >= 0.0)
-        W = sp.diags_array(z**2)
-        H = sp.csc_matrix(G.T @ W @ G)
-        ridge = 1e-12 * max(float(H.diagonal().max(initial=0.0)), 1e-300)
-        step = splu(sp.csc_matrix(H + ridge * sp.eye(free.size))).solve(np.where(allowed, 0.0, v))
-        z = _signed(program, z - W @ (G @ step))
-        if certifies(program, z):
-            return z
-    return None
+    z = _signed(program, z)
+    lo, hi, G = program.lo[free], program.hi[free], program.G[:, free]
+    try:
+        for _ in range(3):
+            v = G.T @ z - slope[free]
+            # A reduced cost -v that a finite end can carry is no error.
+            carried = (np.isfinite(lo) & (v <= 0.0)) | (np.isfinite(hi) & (v >= 0.0))
+            W = sp.diags_array(z**2)
+            H = sp.csc_matrix(G.T @ W @ G)
+            ridge = 1e-12 * max(float(H.diagonal().max(initial=0.0)), 1e-300)
+            step = splu(sp.csc_matrix(H + ridge * sp.eye(free.size))).solve(np.where(carried, 0.0, v))
+            z = _signed(program, z - W @ (G @ step))
+    except RuntimeError:  # singular: nothing to gain
+        return None
+    return z if np.isfinite(z).all() else None
 
 
 def _descends(program: Program, ray: Array) -> bool:
@@ -568,6 +583,10 @@ class _Scaled:
             x, z, check = judge(program, x, z)
             if check.worst < _NEAR:
                 x, z, check = _polished(program, x, z, check)
+                slope = program.c if program.P is None else program.c + program.P @ x
+                exact = _cleaned(program, z, slope) if check.worst > _SHARP else None
+                if exact is not None:
+                    x, z, check = min((x, z, check), judge(program, x, exact), key=lambda point: point[2].worst)
             if check.worst <= TOLERANCE:
                 return _Found(Verdict.OPTIMAL, x, z, check, solver.name, count)
             verdict = Verdict.REDUCED if check.worst <= REDUCED else Verdict.FAILED

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 #: Public names and the module of each, loaded when first used.
 _HOME: dict[str, str] = {
     "Check": "check",
-    "Gap": "track",
     "Frame": "frames",
+    "Gap": "track",
     "Limits": "formats",
     "Log": "log",
     "METHODS": "estimators",

@@ -50,6 +50,9 @@ _START = np.array([0.1, 0.05, 0.01, 0.3, 0.3])
 _FLOOR = np.array([1e-3, 1e-4, 1e-5, 1e-4, 3e-3])
 _CEILING = np.array([30.0, 3.0, 3.0, 30.0, 1e3])
 
+#: Rows of all drives that are solved side by side at most, but for a single longer drive.
+_BATCH = 20_000
+
 E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS = range(7)
 
 
@@ -126,12 +129,26 @@ def solve(
     list of Fit
         With ``path.status`` STALLED where the numbers broke down; such a path is not to be used.
     """
-    if not drives:
-        return []
-    drives = [_with_speed(drive) for drive in drives]
+    start = np.broadcast_to(_START if sigma is None else sigma, (len(drives), 5))
+    first = [None] * len(drives) if azimuth is None else list(azimuth)
+    fits: list[Fit] = []
+    # so many at a time that a day of driving fits into memory
+    rows = np.cumsum([len(drive) for drive in drives])
+    for batch in np.unique(rows // _BATCH):
+        which = np.flatnonzero(rows // _BATCH == batch).tolist()
+        fits += _solved(
+            [_with_speed(drives[i]) for i in which], settings, start[which], [first[i] for i in which], learn
+        )
+    return fits
+
+
+def _solved(
+    drives: Sequence[Grid], settings: Chain, sigma: Floats, azimuth: Sequence[Floats | None], learn: bool
+) -> list[Fit]:
     rows = _rows(drives)
-    psi = np.concatenate([azimuth_of(drive) for drive in drives] if azimuth is None else list(azimuth))
-    s2 = np.array(np.broadcast_to(_START if sigma is None else sigma, (len(drives), 5))) ** 2
+    given = zip(drives, azimuth, strict=True)
+    psi = np.concatenate([azimuth_of(drive) if first is None else first for drive, first in given])
+    s2 = sigma**2
     for k in range(settings.rounds):
         line = _linearised(rows, psi)
         out = _smoothed(rows, line, s2, settings)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import evidence
+from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.log import STREAMS, Log
 from halfwidth.vehicle.repair import (
     contradicted_convention,
@@ -207,6 +208,7 @@ def check(log: Any) -> Check:
         _pauses(log),
         swapped,
         *moving,
+        _trust(log) if swapped.verdict != "bad" else Item("trust", "not checked", "put the position right first"),
         _standstill(log),
         *_steps(log),
         _speed_scale(log),
@@ -330,6 +332,18 @@ def _outliers(log: Log) -> Item:
         f"{int(bad.sum())} of {bad.size} fixes jump further than a speed of {top:.0f} m/s explains, at {times}{more} s",
         float(bad.sum()),
     )
+
+
+def _trust(log: Log) -> Item:
+    """Look for fixes that were frozen or jumped, with what a car can have done in between."""
+    n = int(log.fixed.sum())
+    if n < 10:
+        return Item("trust", "not checked", "too few fixes")
+    found = distrusted(log)
+    if not len(found):
+        return Item("trust", "ok", "no fix is frozen or jumps", 0.0)
+    said = "; ".join(words.removesuffix(": not used") for words in found.words(log))
+    return Item("trust", "bad" if len(found) > 0.05 * n else "warn", said, float(len(found)))
 
 
 def _speed(log: Log) -> Item:

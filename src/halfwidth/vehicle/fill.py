@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle import calibrate, chain
+from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, usable
 from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.grid import Grid, sampled
@@ -38,8 +39,14 @@ PIECE, CONTEXT, PAUSE = 600.0, 60.0, 60.0
 #: A pause between fixes of this length is a gap even where it is usual in the log, s.
 LONG = 5.0
 
+#: A pause of the whole log of more than this many usual fix intervals, and of `PAUSE` at most, gets rows of its own.
+ROWLESS = 2.5
+
 #: Fixes that a method with a model of motion needs.
 FEWEST = 5
+
+#: Times that fixes are screened for strays at most.
+_SCREENINGS = 3
 
 #: Rounds in which the chain is solved again with hidden fixes, its scales kept.
 _AGAIN = 3
@@ -51,6 +58,7 @@ def fill(
     method: str | None = None,
     level: float = 0.9,
     clock_offset: float | None = None,
+    distrust: bool = True,
 ) -> Track:
     """Fill the gaps of a log.
 
@@ -66,12 +74,16 @@ def fill(
     clock_offset : float, optional
         Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; 0 if
         absent.
+    distrust : bool
+        Whether fixes that only repeat the one before while the car moves are found and bridged; the track's messages
+        name them.
 
     Returns
     -------
     Track
         Every fix, every row between fixes that are further apart than 1.5 times the usual, and every row before the
-        first and after the last fix.
+        first and after the last fix. Where the whole log pauses between two fixes, as a receiver's own log does in a
+        tunnel, rows are added at the usual rate of the fixes; a pause of more than a minute is left open.
 
     Raises
     ------
@@ -86,9 +98,14 @@ def fill(
     drive_log, native = as_log(log)
     if not drive_log.fixed.any():
         raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
+    messages: list[str] = []
+    if distrust:
+        doubtful = distrusted(drive_log, jumps=False)  # stray ones show against speed and yaw rate, later
+        messages.extend(doubtful.words(drive_log))
+        drive_log = doubtful.masked(drive_log)
+    drive_log = _with_pauses_filled(drive_log, messages)
     offset = 0.0 if clock_offset is None else float(clock_offset)
     grid = sampled(drive_log, clock_offset=offset)
-    messages: list[str] = []
     chosen = _chosen(grid, asked, messages)
     if clock_offset is None and chosen.name not in ("linear", "cv"):
         messages.append("the clocks of fixes and sensors were taken to agree")
@@ -165,6 +182,31 @@ def _chosen(grid: Grid, asked: Method | None, messages: list[str]) -> Method:
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
+
+
+def _with_pauses_filled(log: Log, messages: list[str]) -> Log:
+    """Add rows where nothing at all arrived between two fixes although at least two fixes were due."""
+    fixes = log.t[log.fixed]
+    if fixes.size < 3:
+        return log
+    usual = float(np.median(np.diff(fixes)))
+    step = np.diff(log.t)
+    pauses = np.flatnonzero((step > ROWLESS * usual) & (log.t[:-1] >= fixes[0]) & (log.t[1:] <= fixes[-1]))
+    open_ = [k for k in pauses if step[k] > PAUSE]
+    messages.extend(
+        f"nothing arrived for {step[k]:.0f} s from {log.t[k]:.1f} s on: longer than {PAUSE:.0f} s, left open"
+        for k in open_
+    )
+    added = [np.linspace(log.t[k], log.t[k + 1], round(step[k] / usual) + 1)[1:-1] for k in pauses if step[k] <= PAUSE]
+    if not added:
+        return log
+    times = np.concatenate(added)
+    total = sum(step[k] for k in pauses if step[k] <= PAUSE)
+    messages.append(
+        f"nothing arrived in {len(added)} pause{'s' if len(added) > 1 else ''} of the log, {total:.1f} s in all:"
+        f" {times.size} rows were added there"
+    )
+    return log.with_rows(times)
 
 
 def _wanted(log: Log) -> tuple[NDArray[np.intp], NDArray[np.str_]]:
@@ -271,7 +313,7 @@ def _estimated(
     pieces: Sequence[_Piece], chosen: Method, lengths: Floats, level: float, messages: list[str]
 ) -> _Answers:
     """Estimate every piece, with simpler methods where the chosen one fails, and test the intervals."""
-    grids = [piece.grid for piece in pieces]
+    grids = [piece.grid for piece in pieces]  # of which the chain takes away the fixes it cannot believe
     able = [i for i, grid in enumerate(grids) if chosen.name == "linear" or int(grid.seen.sum()) >= FEWEST]
     found, rerun, settings = _chain(grids, able, messages) if chosen.name == "em" else _plain(chosen, grids, able)
     failed = [i for i in range(len(grids)) if i not in found or not _plausible(found[i], grids[i])]
@@ -297,10 +339,24 @@ def _estimated(
 
 
 def _chain(
-    grids: Sequence[Grid], able: Sequence[int], messages: list[str]
+    grids: list[Grid], able: Sequence[int], messages: list[str]
 ) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
     """Solve the chain for the pieces that have enough fixes."""
     fits = dict(zip(able, chain.solve([grids[i] for i in able]), strict=True))
+    stray: list[float] = []
+    todo = list(able)
+    for _ in range(_SCREENINGS):
+        hidden = {i: _stray(fits[i].path, grids[i]) for i in todo}
+        todo = [i for i in todo if hidden[i].any()]
+        for i in todo:
+            stray += grids[i].t[hidden[i]].tolist()
+            grids[i] = grids[i].masked(hidden[i])
+        fits |= zip(todo, chain.solve([grids[i] for i in todo]), strict=True)
+    if stray:
+        times = sorted(set(stray))
+        words = ", ".join(f"{t:.1f}" for t in times[:5]) + (" ..." if len(times) > 5 else "")
+        some = "1 fix is" if len(times) == 1 else f"{len(times)} fixes are"
+        messages.append(f"{some} far from where the vehicle can have been and left out: t = {words} s")
 
     def rerun(which: Sequence[int], hidden: Sequence[Grid]) -> list[Path]:
         return [
@@ -330,6 +386,17 @@ def _chain(
             " the half-widths have it added"
         )
     return {i: fit.path for i, fit in fits.items()}, rerun, settings
+
+
+def _stray(path: Path, grid: Grid) -> NDArray[np.bool_]:
+    """Return the nodes whose fix is far off the path, (T,): one multipath fix must not set the noise of the drive.
+
+    Far is beyond 8 times the median distance, 5 standard deviations of a fix and 3 m. Where more than a tenth of the
+    fixes would go it is the path that is wrong, and none goes.
+    """
+    off = np.hypot(path.east - grid.east, path.north - grid.north)
+    far = grid.seen & ~(off <= max(8 * float(np.median(off[grid.seen])), 5 * path.fix_variance**0.5, 3.0))
+    return far if path.finite and far.sum() <= 0.1 * grid.seen.sum() else np.zeros(len(grid), dtype=bool)
 
 
 def _plain(

@@ -118,8 +118,8 @@ class Log:
             row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
             raise BadValue(
                 f"`t` goes from {t[row - 1]:.10g} s to {t[row]:.10g} s in row {row}, strictly"
-                " increasing times are expected\nhint: `halfwidth.vehicle.from_frame` sorts rows"
-                " and joins those with equal times"
+                " increasing times are expected",
+                hint="`halfwidth.vehicle.from_frame` sorts rows and joins those with equal times",
             )
         object.__setattr__(self, "t", t)
         for name in STREAMS:
@@ -236,6 +236,27 @@ class Log:
         wide = step > GAP_FACTOR * np.median(step) * (1 + 1e-9)
         return [(float(t[k]), float(t[k + 1])) for k in np.flatnonzero(wide)]
 
+    def with_rows(self, times: ArrayLike) -> "Log":
+        """Return the log with further rows at which nothing arrived, where a position is wanted.
+
+        Parameters
+        ----------
+        times : (K,) array_like
+            Times in seconds, none of them a time of the log.
+
+        Raises
+        ------
+        BadValue
+            If a time is not finite, or is one of the log already.
+        """
+        more = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        t = np.concatenate((self.t, more))
+        order = np.argsort(t, kind="stable")
+        streams: dict[str, Any] = {
+            name: np.concatenate((getattr(self, name), np.full(more.size, np.nan)))[order] for name in STREAMS
+        }
+        return replace(self, t=t[order], **streams)
+
     def rates(self) -> dict[str, float | None]:
         """Give the usual rate of each stream.
 
@@ -285,7 +306,7 @@ def to_frame(columns: Mapping[str, Any], native: str) -> Any:
     try:
         library = import_module(native)
     except ImportError as error:
-        raise Missing(f"`native` is {native!r} but {native} is not installed\nhint: pip install {native}") from error
+        raise Missing(f"`native` is {native!r} but {native} is not installed", hint=f"pip install {native}") from error
     table = {name: np.array(values) for name, values in columns.items()}
     return library.table(table) if native == "pyarrow" else library.DataFrame(table)
 

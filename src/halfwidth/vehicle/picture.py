@@ -144,12 +144,15 @@ def pauses_of(t: Floats) -> Rows:
 
 
 def limits_of(half_m: Floats, most: int = 5) -> list[float]:
-    """Choose the limits between the colours of half-widths: from the series 1, 2, 5, in metres."""
+    """Choose the limits between the colours in metres: 1, 2, 5, 10 and so on, or even ones if they are alike."""
     if half_m.size == 0:
         return []
     low, high = float(half_m.min()), float(half_m.max())
     series = [m * 10.0**k for k in range(-3, 7) for m in (1, 2, 5)]
-    return [float(f"{x:.3g}") for x in series if low < x < high][-most:]
+    limits = [x for x in series if low < x < high][-most:]
+    if len(limits) < 3 and high > 1.15 * low:
+        limits = [x for x in steps(low, high, most - 1).tolist() if low < x < high]
+    return [float(f"{x:.3g}") for x in limits]
 
 
 def legend_of(limits: Sequence[float]) -> list[str]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from halfwidth.errors import BadLog
 from halfwidth.vehicle import evidence
 from halfwidth.vehicle.formats.cells import NO_TIME, seconds
-from halfwidth.vehicle.formats.layout import FACTORS, KIND, ROLES, Use
+from halfwidth.vehicle.formats.layout import FACTORS, KIND, ROLES, SEMICIRCLE, Use
 from halfwidth.vehicle.formats.raw import Raw
 from halfwidth.vehicle.log import STREAMS, Log
 
@@ -160,6 +160,8 @@ def _time(raw: Raw, notes: list[str]) -> tuple[Floats, float | None]:
                 notes.append(f"{_n(int(wraps[-1]), 'midnight')} passed")
             stamps[held] = clock + wraps * 86_400 * 10**9
             return seconds(stamps)[0], None
+        if raw.times.zoneless:
+            notes.append("time stamps without a zone taken as UTC")
         t, base = seconds(stamps)
         return t, base
     values = np.where(np.abs(raw.values["time"]) > 1e20, np.nan, raw.values["time"])
@@ -484,6 +486,14 @@ def _unstated_units(log: Log, raw: Raw, notes: list[str]) -> Log:
         if far or (rad.enough and deg.value < 0.5 * rad.value):
             log = replace(log, azimuth_rad=np.radians(log.azimuth_rad))
             notes.append("azimuth without a unit read as degrees")
+    scaled = "latitude and longitude read as 1e-7 degrees"
+    if scaled in notes and not _stated(raw, "lat"):
+        factor = SEMICIRCLE / 1e-7
+        other = replace(log, lat_deg=log.lat_deg * factor, lon_deg=log.lon_deg * factor)
+        given, tried = evidence.speed_ratio(log), evidence.speed_ratio(other)
+        if tried.enough and abs(np.log(tried.value)) < 0.05 < abs(np.log(given.value)) and tried.spread < given.spread:
+            log = other
+            notes[notes.index(scaled)] = "latitude and longitude read as semicircles, as the speed says"
     if not _stated(raw, "speed") and np.isfinite(log.speed_mps).any():
         row = matched_factor(evidence.speed_ratio(log))
         if row is not None and row[3] == 1:
@@ -563,19 +573,16 @@ def swapped_columns(log: Log) -> bool:
     if not log.fixed.any() or float(np.nanmax(np.abs(log.lon_deg))) > 90:
         return False
     given, other = evidence.speed_ratio(log), evidence.speed_ratio(log, swapped=True)
-    by_speed = (
-        given.enough
-        and other.enough
-        and abs(np.log(other.value)) < 0.1
-        and other.spread < 0.08
-        and (given.spread > 2 * other.spread + 0.02 or abs(np.log(given.value)) > 0.2)
-    )
+    fits = other.enough and abs(np.log(other.value)) < 0.1 and other.spread < 0.08
+    # swapped degrees stretch one direction only, so ratios scatter with the course
+    stretched = given.enough and given.spread > 2 * other.spread + 0.02
     name = "radians clockwise from north"
     course, other_course = evidence.course_errors(log)[name], evidence.course_errors(log, swapped=True)[name]
     if course.enough and other_course.enough:
-        by_course = course.value > 0.4 and other_course.value < 0.15
-        return by_course and (by_speed or not given.enough)
-    return by_speed
+        by_speed = fits and (stretched or abs(np.log(given.value)) > 0.2)
+        return course.value > 0.4 and other_course.value < 0.15 and (by_speed or not given.enough)
+    # a wrong scale of the speed looks alike on a straight road: the stretch alone decides
+    return fits and stretched
 
 
 def _limits(log: Log, notes: list[str], room: float) -> Log:

@@ -112,8 +112,8 @@ def kind_of_bound(track: Track) -> str:
         ),
         "credible": (
             f"{share} credible interval",
-            f"where a fix would be, east and north each lie inside with probability {share} under the model that was"
-            " fitted to this log. That is not a guarantee, and an error that all fixes share is not in it.",
+            f"east and north each lie inside with probability {share} under the model that was fitted to this log. That"
+            " is not a guarantee, and an error that all fixes of the drive share cannot be seen in its log.",
         ),
         "none": ("indication of size", "no probability is claimed for it."),
     }[track.guarantee]

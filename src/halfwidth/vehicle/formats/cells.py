@@ -19,6 +19,8 @@ MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-",
 
 _HEMISPHERE = re.compile(r"^\s*([NSEWnsew])?\s*([+-]?[\d.,]+)\s*°?\s*([NSEWnsew])?\s*$")
 _TIME_OF_DAY = re.compile(r"^\s*(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d+))?\s*$")
+_NAMED_MONTH = re.compile(r"^\s*(\d{1,2})[ -]([A-Za-z]{3})[a-z]*[ -](\d{4})(.*)$")
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _DOTTED_DATE = re.compile(r"^\s*(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)$")
 
 #: Marks a cell without a time among nanoseconds.
@@ -44,10 +46,11 @@ class Tally:
 
 @dataclass
 class Times:
-    """Stamps as nanoseconds; `absolute` once a date was seen, `of_day` once one had none."""
+    """What stamps had: a date (`absolute`), none (`of_day`), a date without a zone (`zoneless`)."""
 
     absolute: bool = False
     of_day: bool = False
+    zoneless: bool = False
     tally: Tally = field(default_factory=Tally)
 
 
@@ -138,6 +141,7 @@ def stamps(cells: Sequence[str], times: Times, first_row: int = 0) -> NDArray[np
                 pass
             else:
                 times.absolute = True
+                times.zoneless |= plain[0] == cells[0]
                 return out
     out = np.full(len(cells), NO_TIME, dtype=np.int64)
     for k, cell in enumerate(cells):
@@ -159,6 +163,9 @@ def _stamp(cell: str, times: Times) -> int | None:
         fraction = int((match[4] or "0")[:9].ljust(9, "0"))
         return ((hour * 60 + minute) * 60 + second) * 1_000_000_000 + fraction
     bare = cell.strip().replace("/", "-")
+    named = _NAMED_MONTH.match(bare)
+    if named and named[2].lower() in _MONTHS:
+        bare = f"{named[3]}-{_MONTHS.index(named[2].lower()) + 1:02d}-{int(named[1]):02d}{named[4]}"
     dotted = _DOTTED_DATE.match(bare)
     if dotted:
         bare = f"{dotted[3]}-{int(dotted[2]):02d}-{int(dotted[1]):02d}{dotted[4]}"
@@ -168,6 +175,7 @@ def _stamp(cell: str, times: Times) -> int | None:
         moment = datetime.fromisoformat(bare)
         if moment.tzinfo is None:
             moment = moment.replace(tzinfo=UTC)
+            times.zoneless = True
         whole = moment.timestamp()
     except (ValueError, OverflowError):
         return None

@@ -125,15 +125,15 @@ class _Body:
             rows = _split(kept, self.header.delimiter)
         except csv.Error as error:
             raise LogTooBig(
-                f"`{self.source.name}` has a quoted cell that does not end ({error})\n"
-                "hint: look for a stray double quote"
+                f"`{self.source.name}` has a quoted cell that does not end ({error})",
+                hint="look for a stray double quote",
             ) from error
         # only the very last line of a file can lack its end
         self.n_rows += len(rows)
         if self.n_rows > self.source.limits.rows:
             raise LogTooBig(
-                f"`{self.source.name}` has more than {self.source.limits.rows} rows, which is the"
-                " limit\nhint: cut it, or pass `limits=` to `halfwidth.vehicle.read`"
+                f"`{self.source.name}` has more than {self.source.limits.rows} rows, which is the limit",
+                hint="cut it, or pass `limits=` to `halfwidth.vehicle.read`",
             )
         if any(len(row) != self.n_names for row in rows):
             rows = self._even(rows)
@@ -181,9 +181,8 @@ class _Body:
             )
         if self.n_long > _MOST_RAGGED * self.n_rows:
             raise BadLog(
-                f"`{name}` has {self.n_long} of {self.n_rows} rows with more cells than the"
-                f" header's {self.n_names}\nhint: decimal commas need another delimiter, such as"
-                " `;`, or quotes"
+                f"`{name}` has {self.n_long} of {self.n_rows} rows with more cells than the header's {self.n_names}",
+                hint="decimal commas need another delimiter, such as `;`, or quotes",
             )
         if self.n_short:
             notes.append(f"{_n(self.n_short, 'row')} shorter than the header, the rest left empty")
@@ -222,8 +221,8 @@ def _lines(source: Source) -> Iterator[list[str]]:
         if len(rest) > limit or any(len(line) > limit for line in lines):
             raise LogTooBig(
                 f"`{source.name}` has a line longer than {limit >> 10} KiB, which is the limit"
-                " (no table, or one with far too many columns)\nhint: give a CSV with one sample a"
-                " line"
+                " (no table, or one with far too many columns)",
+                hint="give a CSV with one sample a line",
             )
         if not block:
             if rest:
@@ -245,25 +244,25 @@ def _encoding(head: bytes, name: str) -> str:
     odd = sum(start.count(bytes([code])) for code in range(32) if code not in (9, 10, 12, 13))
     if b"\0" in start[:4096] or odd > 0.01 * len(start):
         raise BadLog(
-            f"`{name}` is not text (binary bytes near the start), CSV, gzip CSV or Parquet is"
-            " expected\nhint: export the signals as CSV or Parquet"
+            f"`{name}` is not text (binary bytes near the start), CSV, gzip CSV or Parquet is expected",
+            hint="export the signals as CSV or Parquet",
         )
     for opening, what in ((b"<gpx", "GPX"), (b"<kml", "KML"), (b"<!doctype html", "a web page"),
                           (b"<html", "a web page")):  # fmt: skip
         if opening in start[:2048].lower():
             raise BadLog(
-                f"`{name}` is {what}, CSV, gzip CSV or Parquet is expected\n"
-                "hint: export a table with time, latitude and longitude"
+                f"`{name}` is {what}, CSV, gzip CSV or Parquet is expected",
+                hint="export a table with time, latitude and longitude",
             )
     if start[:1] in b"{[" and start[:1]:
         raise BadLog(
-            f"`{name}` is JSON, CSV, gzip CSV or Parquet is expected\n"
-            "hint: export a table with time, latitude and longitude"
+            f"`{name}` is JSON, CSV, gzip CSV or Parquet is expected",
+            hint="export a table with time, latitude and longitude",
         )
     if start.startswith((b"$GP", b"$GN", b"!AI")):
         raise BadLog(
-            f"`{name}` is NMEA, CSV, gzip CSV or Parquet is expected\n"
-            "hint: convert it, for example with `gpsbabel -i nmea -o unicsv`"
+            f"`{name}` is NMEA, CSV, gzip CSV or Parquet is expected",
+            hint="convert it, for example with `gpsbabel -i nmea -o unicsv`",
         )
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head)
@@ -289,8 +288,8 @@ def _header(lines: Sequence[str], asked: Mapping[str, str], source: Source) -> _
             n_cells = bare.count(delimiter) + 1 if delimiter else len(bare.split())
             if n_cells > limits.columns:
                 raise LogTooBig(
-                    f"`{source.name}` has {n_cells} columns in line {index + 1}, at most"
-                    f" {limits.columns} are read\nhint: give one sample a line, one signal a column"
+                    f"`{source.name}` has {n_cells} columns in line {index + 1}, at most {limits.columns} are read",
+                    hint="give one sample a line, one signal a column",
                 )
             cells = _split([bare], delimiter)[0]
             found = _Header(delimiter, index, tuple(cell.strip() for cell in cells), line)
@@ -304,11 +303,11 @@ def _header(lines: Sequence[str], asked: Mapping[str, str], source: Source) -> _
         return best[1]
     if widest is not None and sum(map(_is_number, widest.names)) * 2 > len(widest.names):
         raise BadLog(
-            f"`{source.name}` has no header line (the first line is numbers), column names are"
-            " expected\nhint: put a first line such as t_s,lat_deg,lon_deg,speed_mps"
+            f"`{source.name}` has no header line (the first line is numbers), column names are expected",
+            hint="put a first line such as t_s,lat_deg,lon_deg,speed_mps",
         )
     names = widest.names if widest is not None else ()
-    raise BadLog(layout.unknown_layout(names, ("time", "lat", "lon"), source.name))
+    raise layout.unknown_layout(names, ("time", "lat", "lon"), source.name)
 
 
 def _split(lines: Sequence[str], delimiter: str | None) -> list[list[str]]:

@@ -39,7 +39,7 @@ _WORDS: Mapping[str, tuple[str, ...]] = {
         "unix_timestamp", "seconds", "sec", "secs", "elapsed", "elapsed_time", "time_elapsed",
         "seconds_elapsed", "iso_time", "log_time", "time_stamp", "header_stamp", "system_time",
         "tow", "time_of_week", "itow", "local_time", "time_of_day", "zeit", "zeitstempel", "cas",
-        "millis", "milliseconds", "microseconds", "nanoseconds",
+        "time_since_start", "time_since_start_in", "millis", "milliseconds", "microseconds", "nanoseconds",
     ),
     "lat": ("lat", "latitude", "lati", "latit", "breite", "breitengrad"),
     "lon": (
@@ -87,7 +87,7 @@ _IDLE = frozenset(
         "location", "loc", "position", "pos", "navsatfix", "wgs84", "sensor", "data", "value",
         "signal", "current", "fused", "measured", "meas", "msl", "ellipsoidal", "hae", "wheel",
         "odo", "odometry", "oxts", "device", "phone", "calibrated", "nav", "pvt", "degree",
-        "obs",
+        "obs", "field", "enhanced",
     }
 )  # fmt: skip
 
@@ -98,10 +98,14 @@ _RECEIVER = frozenset({"gps", "gnss", "doppler", "nav", "pvt"})
 
 _DEG = math.pi / 180
 
+#: Degrees in one unit of the integers that FIT files hold.
+SEMICIRCLE = 180 / 2**31
+
 #: What one of each unit is in the unit of the log, by kind.
 FACTORS: Mapping[str, Mapping[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
-    "position": {"deg": 1.0, "rad": 1 / _DEG, "1e-7 deg": 1e-7, "1e-6 deg": 1e-6},
+    "position": {"deg": 1.0, "rad": 1 / _DEG, "1e-7 deg": 1e-7, "1e-6 deg": 1e-6,
+                 "semicircles": SEMICIRCLE},
     "length": {"m": 1.0, "ft": 0.3048, "cm": 0.01, "mm": 1e-3, "km": 1e3},
     "angle": {"rad": 1.0, "deg": _DEG, "mrad": 1e-3},
     "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600, "ft/s": 0.3048,
@@ -122,7 +126,7 @@ _SPELLINGS: Mapping[str, Mapping[str, str]] = {
              "ns": "ns nsec nanosecond nanoseconds nanos", "min": "min minutes", "h": "h hours"},
     "position": {"deg": "deg degree degrees ° wgs84 dd", "rad": "rad radian radians",
                  "1e-7 deg": "1e-7 1e7 e7 1e-7deg deg*1e-7 degx1e7",
-                 "1e-6 deg": "1e-6 1e6 e6 1e-6deg deg*1e-6"},
+                 "1e-6 deg": "1e-6 1e6 e6 1e-6deg deg*1e-6", "semicircles": "semicircles semicircle"},
     "length": {"m": "m meter meters metre metres", "ft": "ft feet foot", "cm": "cm", "mm": "mm",
                "km": "km"},
     "angle": {"rad": "rad radian radians", "deg": "deg degree degrees °", "mrad": "mrad"},
@@ -203,7 +207,7 @@ def parse_columns(text: str) -> dict[str, str]:
         role, equals, column = part.partition("=")
         if not equals or not column.strip():
             raise BadLog(
-                f"`columns` holds {part.strip()!r}, ROLE=COLUMN is expected\nhint: lat=Breite,lon=Laenge,speed=v[km/h]"
+                f"`columns` holds {part.strip()!r}, ROLE=COLUMN is expected", hint="lat=Breite,lon=Laenge,speed=v[km/h]"
             )
         asked[role.strip()] = column.strip()
     return asked
@@ -352,7 +356,7 @@ def recognise(
         uses["time"] = Use("time", date.index, date.column)
         lacking = []
     if lacking:
-        raise BadLog(unknown_layout(names, lacking, source))
+        raise unknown_layout(names, lacking, source)
     said = ", ".join(
         f"{role} from `{_shown(use.column)}`" + (f" in {use.unit}" if use.unit else "") for role, use in uses.items()
     )
@@ -406,17 +410,15 @@ def _use_asked(role: str, spec: str, names: Sequence[str], source: str) -> Use:
     return Use(role, bare.index(column), column, unit, sign, asked=True)
 
 
-def unknown_layout(names: Sequence[str], lacking: Sequence[str], source: str) -> str:
+def unknown_layout(names: Sequence[str], lacking: Sequence[str], source: str) -> BadLog:
     """Say what was found, what is needed and what to type."""
     words = {"time": "time", "lat": "latitude", "lon": "longitude"}
-    missing = ", ".join(words[role] for role in lacking)
     typed = ",".join(f"{role}=NAME" for role in lacking)
-    return (
-        f"`{source}` has no column that is read as {missing}; found: {_listed(names)};"
-        " needed: time, latitude, longitude; used where there: speed, yaw rate, azimuth, height,"
-        " acceleration\n"
-        f"hint: say which column it is: --columns {typed} (with a unit where needed:"
-        " speed=NAME[km/h])"
+    return BadLog(
+        f"`{source}` has no column that is read as {', '.join(words[role] for role in lacking)};"
+        f" found: {_listed(names)}; needed: time, latitude, longitude; used where there: speed, yaw rate, azimuth,"
+        " height, acceleration",
+        hint=f"say which column it is: --columns {typed} (with a unit where needed: speed=NAME[km/h])",
     )
 
 

@@ -41,7 +41,7 @@ class Limits:
     rows: int = 20_000_000
     total_bytes: int = 8 << 30
     ratio: float = 100.0
-    ratio_from: int = 4 << 20
+    ratio_from: int = 1 << 19
 
 
 #: First bytes of what is often mistaken for a log, and what to do about it.
@@ -89,15 +89,15 @@ class Source:
             self._tail, self._head = self._head, b""
             self._head = self._inflate()
             if self._head[:2] == b"\x1f\x8b":
-                raise BadLog(f"`{name}` is compressed twice, gzip once is expected\nhint: `gunzip` it first")
+                raise BadLog(f"`{name}` is compressed twice, gzip once is expected", hint="`gunzip` it first")
             if self._head[:4] == b"PAR1":
                 raise BadLog(
-                    f"`{name}` is a Parquet file inside gzip, Parquet alone is expected\nhint: `gunzip` it first"
+                    f"`{name}` is a Parquet file inside gzip, Parquet alone is expected", hint="`gunzip` it first"
                 )
         self.kind = "parquet" if self._head[:4] == b"PAR1" else "text"
         for magic, what, way_out in _FOREIGN:
             if self._head.startswith(magic):
-                raise BadLog(f"`{name}` is {what}, CSV, gzip CSV or Parquet is expected\nhint: {way_out}")
+                raise BadLog(f"`{name}` is {what}, CSV, gzip CSV or Parquet is expected", hint=f"{way_out}")
 
     @property
     def head(self) -> bytes:
@@ -157,8 +157,8 @@ class Source:
         self._n_out += n
         if self._n_out > self.limits.total_bytes:
             raise LogTooBig(
-                f"`{self.name}` holds more than {self.limits.total_bytes >> 20} MiB, which is the"
-                " limit\nhint: cut it, or pass `limits=` to `halfwidth.vehicle.read`"
+                f"`{self.name}` holds more than {self.limits.total_bytes >> 20} MiB, which is the limit",
+                hint="cut it, or pass `limits=` to `halfwidth.vehicle.read`",
             )
         if (
             self._zip is not None
@@ -166,8 +166,8 @@ class Source:
             and self._n_out > self.limits.ratio * max(self._n_in - len(self._tail), 1)
         ):
             raise LogTooBig(
-                f"`{self.name}` expands more than {self.limits.ratio:g} times, which no real log"
-                " does\nhint: if it is one, `gunzip` it first"
+                f"`{self.name}` expands more than {self.limits.ratio:g} times, which no real log does",
+                hint="if it is one, `gunzip` it first",
             )
 
 
@@ -216,14 +216,14 @@ def open_source(path: str | os.PathLike[str], limits: Limits) -> tuple[Source, B
         raise BadLog(f"`path` is {name!r}, a path without NUL is expected")
     if os.path.isdir(name):
         raise BadLog(
-            f"`{name}` is a directory, a log file is expected\nhint: give one file; a folder of"
-            " logs is a shell loop away"
+            f"`{name}` is a directory, a log file is expected",
+            hint="give one file; a folder of logs is a shell loop away",
         )
     try:
         stream = open(name, "rb")  # noqa: SIM115 - the caller closes it
     except OSError as error:
-        hint = "\nhint: check the spelling" if isinstance(error, FileNotFoundError) else ""
-        raise BadLog(f"`{name}` cannot be read: {_reason(error)}{hint}") from error
+        hint = "check the spelling" if isinstance(error, FileNotFoundError) else None
+        raise BadLog(f"`{name}` cannot be read: {_reason(error)}", hint=hint) from error
     try:
         return Source(stream, name, limits), stream
     except BaseException:

@@ -57,11 +57,13 @@
   function drawTip() {
     const left = (100 * (x[current] - view.x)) / view.w, top = (100 * (y[current] - view.y)) / view.h;
     tip.classList.toggle("hide", left < 0 || left > 100 || top < 0 || top > 100);
-    tip.classList.toggle("left", left > 65);
-    tip.classList.toggle("above", top > 80);
-    tip.style.left = `${left}%`;
-    tip.style.top = `${top}%`;
     tip.textContent = `${clock(current).split(" (")[0]} · ± ${Math.max(east[current], north[current]).toFixed(2)} m`;
+    // below the place and to its right, or wherever there is room
+    const box = map.getBoundingClientRect();
+    const px = (left / 100) * box.width, py = (top / 100) * box.height;
+    const below = py + 18 + tip.offsetHeight < box.height - 4;
+    tip.style.left = `${Math.max(Math.min(px + 14, box.width - tip.offsetWidth - 4), 4)}px`;
+    tip.style.top = `${below ? py + 18 : py - 18 - tip.offsetHeight}px`;
   }
 
   // the whole drive in whatever shape the map has on this screen
