@@ -24,7 +24,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import halfwidth._core as _core
+from halfwidth._core import lp_solve
 from halfwidth.array import Array
 from halfwidth.model import Linear
 from halfwidth.record import Record
@@ -218,7 +218,7 @@ def solve(
         Its status is OK only with a relative gap of at most 1e-8 (or `central_gap`); INFEASIBLE only with a proof.
     """
     c = chain
-    x, theta, s, lam, slack, info = _core.lp_solve(*_arrays(c), POINTS[point], tol, central_gap, max_iter, multipliers)
+    x, theta, s, lam, slack, info = lp_solve(*_arrays(c), POINTS[point], tol, central_gap, max_iter, multipliers)
     status = _STATUS[info["status"]]
     answer = Answer(
         x, theta, s, lam, slack, status, info["objective"], info["gap"], info["iterations"], info["scale"], "banded"
