@@ -524,7 +524,7 @@ def test_info_is_complete():
     assert np.all(np.isnan(info["e"][~record.seen]))
     np.testing.assert_array_equal(info["rows"], np.r_[[30.0] * 3, record.seen.sum(axis=0)])
     assert np.all(info["redundancy"] <= info["rows"])
-    assert est.method == "BatchLP(point="least_squares")"
+    assert est.method == "BatchLP(point='least_squares')"
 
 
 def test_redundancy_counts_the_degrees_of_freedom():
