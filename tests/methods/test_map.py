@@ -210,7 +210,9 @@ def test_matrices_that_follow_the_step():
     )
     u = np.full((5, 1), 2.0)
     position = 1.0 + 3.0 * t + t**2
-    est = hw.estimate(model, hw.Record(t, np.where(t == 0.6, np.nan, position)[:, None], u), BatchLP(point="least_squares")).check()
+    est = hw.estimate(
+        model, hw.Record(t, np.where(t == 0.6, np.nan, position)[:, None], u), BatchLP(point="least_squares")
+    ).check()
     np.testing.assert_allclose(est.x[:, 0], position, atol=1e-7)
     np.testing.assert_allclose(est.x[:, 1], 3.0 + 2.0 * t, atol=1e-6)
 
