@@ -137,4 +137,4 @@ def stochastic(method):
 
 def point_only(method):
     """Whether a method gives a point without a spread."""
-    return type(method).__name__ == "BatchLP"
+    return type(method).__name__ in ("BatchLP", "SequentialLP", "Window")

@@ -567,7 +567,7 @@ def test_small_random_programs_also_of_growing_models_and_of_data_that_fit_exact
         A, C, y = rng.normal(size=(nx, nx)), rng.normal(size=(ny, nx)), rng.normal(size=(T, ny))
         y[rng.random(y.shape) < 0.3] = np.nan
         model = hw.Linear(A, None, C, unknown, unknown, hw.Box(-3, 3), bounds=(-10, 10))
-        est = hw.estimate(model, hw.Record(np.arange(T), y), hw.BatchLP(objective="paper")).check()
+        est = hw.estimate(model, hw.Record(np.arange(T), y), hw.BatchLP(objective="paper", point="optimal")).check()
         np.testing.assert_allclose(est.q.sum() + est.r.sum(), _by_highs(A, C, y, [3] * nx, 10, 5), rtol=1e-5, atol=1e-5)
 
 
@@ -575,7 +575,7 @@ def test_data_that_fit_exactly_outside_of_the_prior():
     unknown = hw.Uniform.unknown(0, 5)
     car = hw.Linear([[1, 1], [0, 1]], None, [[1, 0]], unknown, unknown, hw.Box([-3, -0.1], [3, 0.1]))
     y = 2.0 * np.arange(4.0)
-    est = hw.estimate(car, hw.Record(np.arange(4), y), hw.BatchLP(objective="paper")).check()
+    est = hw.estimate(car, hw.Record(np.arange(4), y), hw.BatchLP(objective="paper", point="optimal")).check()
     best = _by_highs(car.A.single, car.C.single, y[:, None], [3, 0.1], np.inf, 5)
     np.testing.assert_allclose(est.q.sum() + est.r.sum(), best, rtol=1e-5)
     assert best > 1.0

@@ -15,7 +15,7 @@ least squares on that face is returned. And **what cannot be known is said**: ha
 data, directions of the state that no output sees, and, where bounds contradict the data, the rows that do so and the
 factor by which all half-widths would have to grow.
 
-The half-widths found are the smallest that explain the data, often exactly 0 for one of them, so they are no bounds of
+The optimal half-widths are the smallest that explain the data, often exactly 0 for one of them, so they are no bounds of
 the noise to come: the estimate has no spread, and `interval` refuses.
 
 References
