@@ -9,9 +9,9 @@ outputs only. With the logarithm linearised, its maximum is the linear program
 
 Three things are added to the paper. The objective is **scaled**: c_j = N_j / sigma_j with sigma_j the group's noise
 level in a least-squares fit, so that metres and radians can be summed; the paper's plain sum is
-``objective="paper"``. The optimum is a **face**, not a point:
-inside a gap the path is free within the bounds that the worst step anywhere has set; by default the trajectory of
-least squares on that face is returned. And **what cannot be known is said**: half-widths that leave no trace in the
+``objective="paper"``. The optimum is a **face**, not a point: inside a gap the path is free within the bounds that the
+worst step anywhere has set; by default the interior point stops on its central path, short of that face, and
+``point="least_squares"`` returns the trajectory of least squares on it. And **what cannot be known is said**: half-widths that leave no trace in the
 data, directions of the state that no output sees, and, where bounds contradict the data, the rows that do so and the
 factor by which all half-widths would have to grow.
 
