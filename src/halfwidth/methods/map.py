@@ -11,12 +11,12 @@ Three things are added to the paper. The objective is **scaled**: c_j = N_j / si
 level in a least-squares fit, so that metres and radians can be summed; the paper's plain sum is
 ``objective="paper"``. The optimum is a **face**, not a point: inside a gap the path is free within the bounds that the
 worst step anywhere has set; by default the interior point stops on its central path, short of that face, and
-``point="least_squares"`` returns the trajectory of least squares on it. And **what cannot be known is said**: half-widths that leave no trace in the
-data, directions of the state that no output sees, and, where bounds contradict the data, the rows that do so and the
-factor by which all half-widths would have to grow.
+``point="least_squares"`` returns the trajectory of least squares on it. And **what cannot be known is said**:
+half-widths that leave no trace in the data, directions of the state that no output sees, and, where bounds contradict
+the data, the rows that do so and the factor by which all half-widths would have to grow.
 
-The optimal half-widths are the smallest that explain the data, often exactly 0 for one of them, so they are no bounds of
-the noise to come: the estimate has no spread, and `interval` refuses.
+The optimal half-widths are the smallest that explain the data, often exactly 0 for one of them, so they are no bounds
+of the noise to come: the estimate has no spread, and `interval` refuses.
 
 References
 ----------
