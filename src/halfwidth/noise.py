@@ -179,7 +179,7 @@ class Gaussian:
             return Gaussian(np.full(n, float(self.Q)))
         if self.Q.shape != (n, n):
             raise BadShape(f"`{name}` has a covariance of shape {self.Q.shape}, ({n}, {n}) was expected")
-        return Gaussian(replace(self.Q, name=f"{name}.Q"))
+        return self if self.Q.name == f"{name}.Q" else Gaussian(replace(self.Q, name=f"{name}.Q"))
 
     def cov(self) -> Varying:
         """Return the covariance (n, n)."""
