@@ -266,9 +266,14 @@ def test_wrong_arguments():
         ({"level": 1.0}, BadValue),
         ({"method": "none"}, BadValue),
         ({"clock_offset": np.inf}, BadValue),
+        ({"level": "a"}, BadValue),
+        ({"level": None}, BadValue),
+        ({"clock_offset": "a"}, BadValue),
+        ({"clock_offset": []}, BadValue),
     ):
-        with pytest.raises(kind):
+        with pytest.raises(kind, match=next(iter(wrong))) as caught:
             fill(log, **wrong)
+        assert caught.value.hint or "method" in wrong
     with pytest.raises(BadLog, match="no fix"):
         fill(Log(t=[0.0, 1.0, 2.0]))
 

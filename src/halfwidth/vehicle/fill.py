@@ -92,8 +92,7 @@ def fill(
     BadValue
         If `level`, `method` or `clock_offset` is none.
     """
-    if not 0 < level < 1:
-        raise BadValue(f"`level` is {level!r}, a probability between 0 and 1 is expected", hint="0.9")
+    level, offset = level_of(level), clock_offset_of(clock_offset)
     asked = None if method is None else method_of(method)
     drive_log, native = as_log(log)
     if not drive_log.fixed.any():
@@ -104,7 +103,6 @@ def fill(
         messages.extend(doubtful.words(drive_log))
         drive_log = doubtful.masked(drive_log)
     drive_log = _with_pauses_filled(drive_log, messages)
-    offset = 0.0 if clock_offset is None else float(clock_offset)
     grid = sampled(drive_log, clock_offset=offset)
     chosen = _chosen(grid, asked, messages)
     if clock_offset is None and chosen.name not in ("linear", "cv"):
@@ -144,6 +142,34 @@ def fill(
         messages=tuple(messages),
         native=native,
     )
+
+
+def level_of(given: Any) -> float:
+    """Return a level as a number between 0 and 1, or raise BadValue."""
+    level = _number(given)
+    if level is None or not 0 < level < 1:
+        raise BadValue(f"`level` is {given!r}, a probability between 0 and 1 is expected", hint="level=0.9")
+    return level
+
+
+def clock_offset_of(given: Any) -> float:
+    """Return a clock offset in seconds, 0 if it is None, or raise BadValue."""
+    offset = 0.0 if given is None else _number(given)
+    if offset is None or not np.isfinite(offset):
+        raise BadValue(
+            f"`clock_offset` is {given!r}, a finite number of seconds is expected", hint="clock_offset=0.0"
+        )
+    return offset
+
+
+def _number(given: Any) -> float | None:
+    """Return a number as a float; None for text and whatever else is no number."""
+    if isinstance(given, str | bytes):
+        return None
+    try:
+        return float(given)
+    except (TypeError, ValueError):
+        return None
 
 
 def as_log(given: Any) -> tuple[Log, str]:
