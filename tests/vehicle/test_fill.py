@@ -256,7 +256,7 @@ def test_inflation_is_interpolated_and_never_below_one():
     two = calibrate.Tested(20.0, 9, 1.0, 2.0, 0.6, 3.0)
     factor = calibrate.inflation([one, two], np.array([1.0, 2.0, np.sqrt(40.0), 20.0, 90.0]))
     np.testing.assert_allclose(factor, [1.0, 1.0, np.sqrt(3.0), 3.0, 3.0])
-    np.testing.assert_allclose(calibrate.inflation([], np.array([1.0, 5.0])), 1.0)
+    np.testing.assert_allclose(calibrate.inflation([], np.array([1.0, 5.0])), 2.0)
     np.testing.assert_allclose(calibrate.inflation([one], np.array([1.0]), least=0.0), 0.7)
 
 
