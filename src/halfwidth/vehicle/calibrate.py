@@ -67,6 +67,8 @@ class Tested:
         Sensors that were hidden together with the fixes.
     by : str
         What filled the stretches.
+    half_m : float
+        Mean half-width at the hidden fixes with the inflation, m.
     """
 
     length_s: float
@@ -77,6 +79,7 @@ class Tested:
     inflation: float
     silent: tuple[str, ...] = ()
     by: str = ""
+    half_m: float = 0.0
 
 
 def lengths_to_test(drives: Sequence[Grid], gaps: Floats) -> list[float]:
@@ -117,9 +120,9 @@ def tested(
     lengths: Sequence[float],
     level: float,
     z: float,
-    silent: tuple[str, ...] = (),
+    silent: tuple[str, ...],
     *,
-    guessed: bool = False,
+    guessed: bool,
 ) -> dict[str, list[Tested]]:
     """Hide stretches of each length and see what widening the interval needs.
 
@@ -196,7 +199,7 @@ def _judged(
     z: float,
     independent: int,
 ) -> Tested | None:
-    factors, weights, means, largest, inside = [], [], [], [], []
+    factors, weights, means, largest, inside, halves = [], [], [], [], [], []
     for (i, _, stretches), path in zip(cases, paths, strict=True):
         drive = drives[i]
         if not path.finite or path.variance is None:
@@ -212,6 +215,7 @@ def _judged(
             means.append(distance.mean())
             largest.append(distance.max())
             inside.append(np.mean(needed <= 1.0))
+            halves.append(z * sd.mean())
     n = len(factors)
     if n < FEWEST:
         return None
@@ -219,13 +223,15 @@ def _judged(
     order = np.argsort(factor)
     share = np.cumsum(weight[order]) / n
     at = min(int(np.searchsorted(share, min(level * (1 + 1 / (independent * n)), 1.0 - 1e-9))), factor.size - 1)
+    inflation = float(factor[order][at])
     return Tested(
         length,
         n,
         float(np.mean(means)),
         float(np.mean(largest)),
         float(np.mean(inside)),
-        float(factor[order][at]),
+        inflation,
+        half_m=inflation * float(np.mean(halves)),
     )
 
 

@@ -3,8 +3,8 @@
 The log is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
 gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened by what
 hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate too are tested by
-hiding these as well, and bridged by constant velocity where that comes nearer to the hidden fixes. A method that fails on a piece is replaced by a simpler one there, and
-the track says so.
+hiding these as well, and bridged by constant velocity where hidden fixes show that to be better. A method that fails on
+a piece is replaced by a simpler one there, and the track says so.
 
 Positions are those that the receiver would have reported. What it is wrong by for minutes at a time is in the fixes on
 both sides of a gap and in the filling between them, and hiding fixes cannot show it. The chain learns how large that
@@ -54,8 +54,9 @@ _SCREENINGS = 3
 #: or, where a gap has no yaw rate or speed to find them by, from what is known without the hidden ones.
 _AGAIN, _AFRESH = 3, 10
 
-#: Constant velocity bridges a gap that lacks sensors if its mean error is below this share of the chain's.
-_BETTER = 0.9
+#: Constant velocity bridges a gap that lacks sensors if its error times its half-width is below this share of the
+#: chain's: the nearer path with the narrower interval that holds, as a single one of them may be luck.
+_BETTER = 0.8
 
 
 def fill(
@@ -163,9 +164,7 @@ def clock_offset_of(given: Any) -> float:
     """Return a clock offset in seconds, 0 if it is None, or raise BadValue."""
     offset = 0.0 if given is None else _number(given)
     if offset is None or not np.isfinite(offset):
-        raise BadValue(
-            f"`clock_offset` is {given!r}, a finite number of seconds is expected", hint="clock_offset=0.0"
-        )
+        raise BadValue(f"`clock_offset` is {given!r}, a finite number of seconds is expected", hint="clock_offset=0.0")
     return offset
 
 
@@ -446,7 +445,9 @@ def _estimated(
     answers = _Answers(paths, bridges, settings)
     settings.update(
         {
-            f"inflation at {one.length_s:.3g} s{_without(one.silent)}{_by(one.by, chosen.name)}": round(one.inflation, 3)
+            f"inflation at {one.length_s:.3g} s{_without(one.silent)}{_by(one.by, chosen.name)}": round(
+                one.inflation, 3
+            )
             for one in answers.tested
         }
     )
@@ -454,14 +455,15 @@ def _estimated(
 
 
 def _nearer(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, simple: str, length: float) -> str:
-    """Return which of two ways came nearer to hidden fixes in stretches about as long as this."""
+    """Return which of two ways came nearer to hidden fixes, and was surer, in stretches about as long as this."""
     if usual not in tests or simple not in tests:
         return simple if simple in tests else usual
 
-    def error(name: str) -> float:
-        return min(tests[name], key=lambda one: abs(np.log(one.length_s / max(length, 1e-3)))).mean_m
+    def loss(name: str) -> float:
+        one = min(tests[name], key=lambda one: abs(np.log(one.length_s / max(length, 1e-3))))
+        return one.mean_m * one.half_m
 
-    return simple if error(simple) < _BETTER * error(usual) else usual
+    return simple if loss(simple) < _BETTER * loss(usual) else usual
 
 
 def _pauses(grid: Grid) -> list[tuple[float, float]]:
@@ -475,7 +477,7 @@ def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, f
     """Take another path between the fixes on both sides of some stretches, shifted so that it meets this one there."""
     seen = np.flatnonzero(grid.seen)
     t = grid.t[seen]
-    columns = {name: np.array(getattr(path, name)) for name in ("east", "north", "azimuth", "speed")}
+    columns: dict[str, Any] = {name: np.array(getattr(path, name)) for name in ("east", "north", "azimuth", "speed")}
     if path.variance is None or other.variance is None:
         return path
     variance = path.variance.copy()
@@ -672,7 +674,8 @@ def _test_words(bridges: Sequence[_Bridge], level: float, usual: str) -> list[st
         longest, most = tested[-1].length_s, max(bridge.span.length for bridge in mine)
         if most > 1.2 * longest:
             found.append(
-                f"the longest gap{without} lasts {most:.0f} s but this log can test intervals only up to {longest:.0f} s"
+                f"the longest gap{without} lasts {most:.0f} s but this log can test intervals only up to"
+                f" {longest:.0f} s"
             )
     return found
 

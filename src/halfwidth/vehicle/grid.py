@@ -10,6 +10,7 @@ that may be.
 from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +99,8 @@ class Grid:
         for name in silent:
             if getattr(self, f"has_{name}"):
                 mean, sd = _silenced(self.t, hidden, getattr(self, name), getattr(self, f"{name}_sd"), *_DRIFT[name])
-                grid = replace(grid, **{name: mean, f"{name}_sd": sd})
+                changed: dict[str, Any] = {name: mean, f"{name}_sd": sd}
+                grid = replace(grid, **changed)
         return grid
 
 
@@ -226,7 +228,7 @@ def _silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
 
 
 def _silenced(t: Floats, hidden: Mask, mean: Floats, sd: Floats, rate: float, most: float) -> tuple[Floats, Floats]:
-    """Return means and deviations of a sensor that says nothing from before each hidden stretch of nodes to after it."""
+    """Return means and deviations of a sensor that says nothing from node to node around each hidden stretch."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], hidden, [False]))))
     h = np.concatenate((np.diff(t)[:1], np.diff(t)))
     middle = t - h / 2

@@ -206,7 +206,11 @@ class Outages:
             lines.append(f"{m:{name}}" + "".join(f"{_pair(c):>16}" for c in row))
         covered = [c for c in self.cells if c.coverage is not None]
         if covered:
-            lines += ["", f"share of hidden fixes inside the methods' own {100 * self.level:g} % interval, before widening", head]
+            lines += [
+                "",
+                f"share of hidden fixes inside the methods' own {100 * self.level:g} % interval, before widening",
+                head,
+            ]
             for m in dict.fromkeys(c.method for c in covered):
                 row = [self._found(m, length) for length in lengths]
                 shares = ["" if c is None or c.coverage is None else f"{c.coverage:.2f}" for c in row]
