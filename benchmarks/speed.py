@@ -1,6 +1,6 @@
 """Speed beside the peers and beside a hand-written C++ loop.
 
-    python benchmarks/speed.py [kalman] [many] [stream] [learn] [growth] [losses]
+    python benchmarks/speed.py [kalman] [growth] [many] [stream] [nonlinear] [learn] [losses] [lp]
 
 Without arguments everything runs. Outputs are compared before anything is timed. Times are CPU times of this process,
 the minimum of repeats, except where wall time is said; a ratio divides two times taken in turns in the same process. A
@@ -8,6 +8,7 @@ peer that is not installed is left out.
 """
 
 import ctypes
+import importlib
 import os
 import pathlib
 import statistics
@@ -339,20 +340,24 @@ def growth():
     )
 
 
-def losses():
-    """Filters for unknown losses beside filterpy's IMM and `particles`."""
-    sys.path.insert(0, str(HERE))
-    from losses import main as run
+def part(module):
+    """The `main` of a benchmark that stands in a file of its own."""
 
-    run()
+    def run():
+        sys.path.insert(0, str(HERE))
+        print()
+        importlib.import_module(module).main()
+
+    return run
 
 
-PARTS = {"kalman": (kalman, growth, many, stream, learn)}
-PARTS |= {part.__name__: (part,) for part in (growth, many, stream, learn, losses)}
+PARTS = {one.__name__: (one,) for one in (growth, many, stream, learn)}
+PARTS |= {module: (part(module),) for module in ("nonlinear", "losses", "lp")}
+PARTS["kalman"] = (kalman, growth, many, stream, *PARTS["nonlinear"], learn)
 
 
 def main():
-    names = sys.argv[1:] or ["kalman"]
+    names = sys.argv[1:] or ["kalman", "losses", "lp"]
     unknown = [name for name in names if name not in PARTS]
     if unknown:
         sys.exit(f"no part {unknown}; there are {', '.join(PARTS)}")

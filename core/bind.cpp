@@ -9,6 +9,8 @@ void bind_kalman(nb::module_& m);
 void bind_tape(nb::module_& m);
 void bind_nonlinear(nb::module_& m);
 void bind_loss(nb::module_& m);
+void bind_lp(nb::module_& m);
+void bind_chain(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -20,4 +22,6 @@ NB_MODULE(_core, m) {
     bind_tape(m);
     bind_nonlinear(m);
     bind_loss(m);
+    bind_lp(m);
+    bind_chain(m);
 }

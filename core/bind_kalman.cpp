@@ -572,7 +572,18 @@ PyObject* push_call(PyObject* self, PyObject* const* args, Py_ssize_t n, PyObjec
         }
     }
     if (!a[0]) return PyErr_Format(PyExc_TypeError, "push() needs y; a row without output is push(None)");
-    return push_impl(*nb::inst_ptr<Stream>(self), a[0], a[1], a[2]);
+    Stream& s = *nb::inst_ptr<Stream>(self);
+    PyObject* newest = push_impl(s, a[0], a[1], a[2]);
+    if (!newest && PyErr_Occurred() == PyExc_TypeError) {  // something in the row is no number
+        PyObject *type, *value, *trace;
+        PyErr_Fetch(&type, &value, &trace);
+        PyErr_Format(s.error.ptr(), "the row holds something that is no number: %S; numbers, None or NaN were expected",
+                     value ? value : Py_None);
+        Py_XDECREF(type);
+        Py_XDECREF(value);
+        Py_XDECREF(trace);
+    }
+    return newest;
 }
 
 PyMethodDef stream_methods[] = {

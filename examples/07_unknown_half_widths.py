@@ -14,9 +14,10 @@ def main():
     )
     record = record.without(60.0, 70.0)
     model = hw.Linear([[0.9, 0.2], [-0.2, 0.9]], None, np.eye(2), unknown, unknown, hw.Box(-1, 1))
-    est = hw.estimate(model, record, hw.BatchLP())
-    print("smallest half-widths that explain the record:", "q =", est.q.round(3), " r =", est.r.round(3))
-    print("mean error:", np.abs(est.x - truth.x).mean().round(3))
+    for point in ("central", "least_squares"):
+        est = hw.estimate(model, record, hw.BatchLP(point=point))
+        error = np.abs(est.x - truth.x).mean()
+        print(f"{point:13}  mean error {error:.3f},  q = {est.q.round(3)},  r = {est.r.round(3)}")
 
     y = record.y.copy()
     y[119, 0] += 9.0  # one output that no trajectory can explain

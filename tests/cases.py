@@ -133,3 +133,8 @@ IDS = [f"{m!r} on {c.name}" for m, c in PAIRS]
 def stochastic(method):
     """Whether a method draws random numbers."""
     return any(f.name in ("particles", "sweeps") for f in dataclasses.fields(method))
+
+
+def point_only(method):
+    """Whether a method gives a point without a spread."""
+    return type(method).__name__ in ("BatchLP", "SequentialLP", "Window")

@@ -8,8 +8,9 @@ import halfwidth as hw
 NAMES = """
 BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud DataQualityWarning Estimate
 Estimator ExtendedKalman FearnheadClifford GPB Gaussian HalfwidthError KalmanFilter KalmanSmoother Learned Linear
-LogTooBig Markov Missing Mixed Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls Status Uniform
-UnscentedKalman Unsolved __version__ estimate forecast from_continuous learn resume score simulate stream
+LogTooBig Markov MemoryChoice Missing Mixed Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls
+SequentialLP Status Uniform UnscentedKalman Unsolved Window __version__ choose_memory ensemble_interval estimate
+forecast from_continuous learn resume score simulate stream
 """
 
 

@@ -219,6 +219,25 @@ CASES = {
         hw.BadValue,
         "lambda x, u, dt",
     ),
+    "a function that fails at t": (lambda: linear(A=lambda t: {}[t]), hw.BadValue, "KeyError"),
+    "R stacked for other rows": (
+        lambda: hw.estimate(linear(e=hw.Gaussian(np.ones((2, 1, 1)))), hw.Record([0.0], [1.0])),
+        hw.BadShape,
+        "`e.Q` is stacked for 2 rows",
+    ),
+    "forecast with stacked matrices": (
+        lambda: hw.forecast(linear(A=np.array([I2])), hw.Record([0.0], [1.0]), 3),
+        hw.BadValue,
+        "function of t",
+    ),
+    "push of text": (lambda: hw.stream(linear(), hw.KalmanFilter()).push("a"), hw.BadRecord, "no number"),
+    "push of a complex number": (lambda: hw.stream(linear(), hw.KalmanFilter()).push(1j), hw.BadRecord, "no number"),
+    "a step that is text": (
+        lambda: hw.stream(linear(), hw.KalmanFilter()).push(1.0, dt="x"),
+        hw.BadRecord,
+        "no number",
+    ),
+    "resume of something else": (lambda: hw.resume(b"HWSTREAM" + bytes(40)), hw.BadValue, "snapshot"),
     "level out of range": (
         lambda: hw.estimate(linear(), hw.Record([0.0], [1.0])).interval(90),
         hw.BadValue,

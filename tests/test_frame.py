@@ -41,6 +41,13 @@ def test_pandas_index_of_dates_is_kept():
     assert list(back.columns) == ["level"]
 
 
+def test_an_index_without_a_name_stays_without():
+    record = hw.Record.from_frame(pd.DataFrame({"y": [1.0, 2.0]}, index=[0.5, 1.5]))
+    back = hw.estimate(WALK, record).to_frame(level=None)
+    assert back.index.name is None
+    assert back.index.tolist() == [0.5, 1.5]
+
+
 def test_time_zones_and_polars_dates():
     index = pd.date_range("2026-03-01 12:00", periods=2, freq="s", tz="Europe/Berlin")
     record = hw.Record.from_frame(pd.DataFrame({"y": [1.0, 2.0]}, index=index))

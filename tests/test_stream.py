@@ -110,8 +110,8 @@ def test_missing_rows(missing):
         ((np.zeros(3),), hw.BadRecord),
         ((1.0,), hw.BadRecord),
         (([1.0, np.inf],), hw.BadRecord),
-        (([1.0, "a"],), TypeError),
-        (([1.0, 2j],), TypeError),
+        (([1.0, "a"],), hw.BadRecord),
+        (([1.0, 2j],), hw.BadRecord),
         (([1.0, 2.0], [1.0]), hw.BadRecord),
         (([1.0, 2.0], None, 0.0), hw.BadRecord),
         (([1.0, 2.0], None, -1.0), hw.BadRecord),
@@ -199,7 +199,7 @@ def test_a_failing_matrix_function_is_heard():
 
     live = hw.stream(dataclasses.replace(walk(), A=A), hw.KalmanFilter())
     live.push(1.0, dt=1.5)
-    with pytest.raises(ZeroDivisionError, match="no such step"):
+    with pytest.raises(hw.BadValue, match="no such step"):
         live.push(1.0, dt=3.0)
     assert live.push(1.0, dt=1.5).status is hw.Status.OK
 

@@ -38,6 +38,9 @@ _HOME: dict[str, str] = {
     "stream": "stream",
     "resume": "stream",
     "forecast": "forecast",
+    "ensemble_interval": "methods.window",
+    "choose_memory": "methods.window",
+    "MemoryChoice": "methods.window",
     "learn": "learn",
     "Learned": "learn",
     "HalfwidthError": "errors",
@@ -89,6 +92,9 @@ if TYPE_CHECKING:
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
+    from halfwidth.methods.window import MemoryChoice as MemoryChoice
+    from halfwidth.methods.window import choose_memory as choose_memory
+    from halfwidth.methods.window import ensemble_interval as ensemble_interval
     from halfwidth.model import Linear as Linear
     from halfwidth.model import Nonlinear as Nonlinear
     from halfwidth.noise import Gaussian as Gaussian

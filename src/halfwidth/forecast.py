@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from halfwidth.array import Array
+from halfwidth.errors import BadValue
 from halfwidth.estimate import estimate
 from halfwidth.methods.kalman import matrices
 from halfwidth.model import Linear, Model
@@ -60,6 +61,12 @@ def forecast(
     >>> ahead.P.ravel().round(3), ahead.info["S"].ravel().round(3)
     (array([1.625, 2.625]), array([2.625, 3.625]))
     """
+    stacked = [name for name, m in model.matrices.items() if m.stacked] if isinstance(model, Linear) else []
+    if stacked:
+        raise BadValue(
+            f"`{stacked[0]}` is stacked row by row, so nothing is known of it beyond the record",
+            hint=f"give `{stacked[0]}` as a function of t",
+        )
     longer = record.extended(steps, dt=dt, u=u)
     est = estimate(model, longer, method)
     s = slice(len(record), len(longer))

@@ -43,7 +43,7 @@ def read_frame(frame: Any, time: str | None, outputs: tuple[str, ...] | None, in
                 hint=f"time={table.columns[0]!r}" if table.columns else None,
             )
         clock = index.to_numpy()
-        name = str(index.name) if index.name is not None else "t"
+        name = "" if index.name is None else str(index.name)
     else:
         _present(table.columns, (time,), "time")
         clock = table[time].to_numpy()
@@ -73,7 +73,7 @@ def write_frame(estimate: "Estimate", level: float | None) -> Any:
             columns |= {f"{name}_lo": lo[:, i], f"{name}_hi": hi[:, i]}
     native = labels.native or _installed()
     if native.__name__ == "pandas" and labels.indexed:
-        index = native.Index(labels.clock if fits else estimate.t, name=labels.time)
+        index = native.Index(labels.clock if fits else estimate.t, name=labels.time or None)
         return native.DataFrame(columns, index=index)
     return make(native, columns)
 

@@ -3,7 +3,7 @@
 A noise is a frozen value without an owner: a scalar parameter takes its size from the model it is given to.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -179,7 +179,7 @@ class Gaussian:
             return Gaussian(np.full(n, float(self.Q)))
         if self.Q.shape != (n, n):
             raise BadShape(f"`{name}` has a covariance of shape {self.Q.shape}, ({n}, {n}) was expected")
-        return self
+        return Gaussian(replace(self.Q, name=f"{name}.Q"))
 
     def cov(self) -> Varying:
         """Return the covariance (n, n)."""

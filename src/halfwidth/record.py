@@ -30,7 +30,7 @@ class Labels:
     Parameters
     ----------
     time : str
-        Name of the time column.
+        Name of the time column, or of the index; empty where the index has none.
     outputs, inputs : tuple of str
     native : module or None
         The frame library, as narwhals names it; None for arrays.

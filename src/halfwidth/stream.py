@@ -152,20 +152,23 @@ def resume(snapshot: bytes, model: Model | None = None) -> Stream:
     if zlib.crc32(data[:-4]) != int.from_bytes(data[-4:], "little"):
         raise BadValue("`snapshot` is damaged: its check sum is wrong")
     size = int.from_bytes(data[12:20], "little")
-    head = json.loads(data[20 : 20 + size])
-    name, settings = head["method"]
+    try:
+        head = json.loads(data[20 : 20 + size])
+        name, settings = head["method"]
+        held, sizes = head["model"], head["sizes"]
+    except (ValueError, KeyError, TypeError):
+        raise BadValue("`snapshot` is not one of a stream: its head cannot be read") from None
     if name not in methods.ESTIMATORS:
         raise BadValue(f"`snapshot` is of `{name}`, which this version does not have")
     if model is None:
-        if head["model"] is None:
+        if held is None:
             raise BadValue("`snapshot` does not hold its model", hint="resume(snapshot, model)")
-        model = _model_from_json(head["model"])
-    if [model.nx, model.ny, model.nu] != head["sizes"]:
+        model = _model_from_json(held)
+    if [model.nx, model.ny, model.nu] != sizes:
         raise BadValue(
-            f"`snapshot` is of a model with nx, ny, nu = {head['sizes']},"
-            f" but `model` has {[model.nx, model.ny, model.nu]}"
+            f"`snapshot` is of a model with nx, ny, nu = {sizes}, but `model` has {[model.nx, model.ny, model.nu]}"
         )
-    live = stream(model, methods.load(name)(**settings))
+    live = stream(model, _method(name, settings))
     try:
         live._core.restore(data[20 + size : -4])
     except ValueError as exc:
@@ -276,11 +279,21 @@ def _settings(method: Any) -> dict[str, Any]:
     for name, value in found.items():
         if isinstance(value, np.integer | np.floating):
             found[name] = value.item()
+        elif type(value).__name__ in methods.ESTIMATORS:  # a method inside a method
+            found[name] = {"method": [type(value).__name__, _settings(value)]}
         elif value is not None and not isinstance(value, bool | int | float | str):
             raise Refused(
                 f"the setting `{name}` of `{typed(method)}` is no plain number or word, so it cannot be saved"
             )
     return found
+
+
+def _method(name: str, settings: dict[str, Any]) -> Any:
+    """Return the method of a snapshot, and the methods inside it."""
+    if name not in methods.ESTIMATORS:
+        raise BadValue(f"`snapshot` is of `{name}`, which this version does not have")
+    found = {k: _method(*v["method"]) if isinstance(v, dict) and "method" in v else v for k, v in settings.items()}
+    return methods.load(name)(**found)
 
 
 def _model_to_json(model: Model) -> dict[str, Any] | None:

@@ -47,6 +47,11 @@ class Varying:
         return self.value is not None and self.value.ndim == 2
 
     @property
+    def stacked(self) -> bool:
+        """Whether every row has a matrix of its own."""
+        return self.value is not None and self.value.ndim == 3
+
+    @property
     def single(self) -> Array:
         """The constant matrix, (rows, columns)."""
         if self.value is None or self.value.ndim != 2:
@@ -86,7 +91,7 @@ class Varying:
             assert self.value is not None
             return self.value if self.value.ndim == 2 else self.value[row]
         given = {"t": t, "dt": dt}
-        matrix = real(self.function(*(given[a] for a in self.of)), self.name, missing=self.unknown)
+        matrix = _called(self.function, self.name, {a: given[a] for a in self.of}, self.unknown)
         if matrix.shape != self.shape:
             raise BadShape(f"`{self.name}` as a function returned shape {matrix.shape}, {self.shape} was expected")
         return matrix if self.check is None else self.check(matrix, self.name)
@@ -118,7 +123,7 @@ def varying(
     """
     if callable(value):
         of = _arguments(value, name)
-        sample = real(value(*([1.0] * len(of))), name, missing=unknown)
+        sample = _called(value, name, dict.fromkeys(of, 1.0), unknown)
         found = Varying(name, _two(sample, name), None, value, of, check, unknown)
         _fits(found.shape, shape, name, expected)
         found.at(1.0, 1.0)
@@ -132,6 +137,18 @@ def varying(
     _fits(matrix.shape[-2:], shape, name, expected)
     matrix = matrix if check is None else check(matrix, name)
     return Varying(name, (matrix.shape[-2], matrix.shape[-1]), frozen(matrix), unknown=unknown)
+
+
+def _called(function: Function, name: str, given: dict[str, float], unknown: bool) -> Array:
+    try:
+        value = function(*given.values())
+    except Exception as exc:
+        at = ", ".join(f"{key} = {number:g}" for key, number in given.items())
+        raise BadValue(
+            f"`{name}` as a function failed at {at} with {type(exc).__name__}: {exc}",
+            hint=f"it is tried at {name}(1.0) when the model is made",
+        ) from exc
+    return real(value, name, missing=unknown)
 
 
 def _two(sample: Array, name: str) -> tuple[int, int]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.cases import CASES, IDS, METHODS, PAIRS
+from tests.cases import CASES, IDS, METHODS, PAIRS, point_only
 
 import halfwidth as hw
 
@@ -16,6 +16,7 @@ def test_answer(method, case):
     assert est.x.shape == (T, nx)
     assert np.isfinite(est.x).all()
     np.testing.assert_array_equal(est.t, case.record.t)
+    assert (est.spread is None) == point_only(method)
     if est.spread is not None:
         lo, hi = est.interval(0.9)
         assert lo.shape == hi.shape == (T, nx)

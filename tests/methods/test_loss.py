@@ -565,3 +565,10 @@ def test_repr():
     assert repr(hw.Markov([0.9, 0.8], 0.7, kind="stale")) == "Markov([0.9, 0.8], [0.7, 0.7], kind='stale')"
     assert repr(hw.Bernoulli.unknown(noise=2.0)) == "Bernoulli.unknown(0.5, noise=2., worth=2)"
     assert "kind=('stale', 'garbage')" in repr(hw.Bernoulli(0.5, kind=("stale", "garbage"), sensors=[[0, 1]]))
+
+
+def test_the_noise_of_lost_samples_is_learned_for_one_sensor_only():
+    two = hw.Bernoulli.unknown([0.7, 0.8], learn_noise=True)
+    model = hw.Linear(np.eye(2), None, np.eye(2), hw.Gaussian(0.1), hw.Gaussian(1.0), hw.Normal([0, 0], 1.0), loss=two)
+    with pytest.raises(hw.Refused, match="learn_noise=False"):
+        hw.estimate(model, hw.Record([0.0], [[1.0, 2.0]]), hw.GPB(depth=2, smooth=True))

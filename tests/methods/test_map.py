@@ -161,14 +161,14 @@ def test_an_unseen_correlated_output_is_eliminated_not_dropped():
     rows = residuals(model, hw.Record([0.0, 1.0, 2.0], y))
     np.testing.assert_allclose(rows.M.toarray()[3:, 1:], (1.0 - 0.4 * 0.5) * np.eye(3))
     np.testing.assert_allclose(rows.S.toarray()[3:], [[0, 1, 0.4]] * 3)
-    est = hw.estimate(model, hw.Record([0.0, 1.0, 2.0], y), BatchLP()).check()
+    est = hw.estimate(model, hw.Record([0.0, 1.0, 2.0], y), BatchLP(point="least_squares")).check()
     np.testing.assert_allclose(est.x[:, 0], 1.0 / 0.8, atol=1e-6)
 
 
 def test_least_squares_stays_inside_the_optimal_half_widths():
     model, record, _ = draw(5, T=80)
     vertex = hw.estimate(model, record, BatchLP(point="optimal"))
-    smooth = hw.estimate(model, record, BatchLP())
+    smooth = hw.estimate(model, record, BatchLP(point="least_squares"))
     sigma = vertex.info["sigma"]
 
     def size(est):
@@ -183,17 +183,17 @@ def test_known_and_unknown_half_widths_together():
     model, record, _ = draw(6, F=False, T=60)
     true_q = np.array([0.3, 0.3, 0.3])
     known = dataclasses.replace(model, w=hw.Uniform(true_q))
-    est = hw.estimate(known, record, BatchLP()).check()
+    est = hw.estimate(known, record, BatchLP(point="least_squares")).check()
     np.testing.assert_array_equal(est.q, true_q)
     assert np.all(np.abs(est.info["w"]) <= true_q * (1 + 1e-7))
     free = hw.estimate(model, record, BatchLP(objective="paper")).check()
     assert np.all(est.r < free.r + 0.5)
     both = dataclasses.replace(known, e=hw.Uniform(1.0))
-    est = hw.estimate(both, record, BatchLP()).check()
+    est = hw.estimate(both, record, BatchLP(point="least_squares")).check()
     np.testing.assert_array_equal(est.r, [1.0, 1.0])
     assert holds(both, record, est)
     one = dataclasses.replace(model, e=hw.Uniform.unknown([0.5, 0.0], [0.5, 9.0]))
-    assert hw.estimate(one, record, BatchLP()).r[0] == 0.5
+    assert hw.estimate(one, record, BatchLP(point="least_squares")).r[0] == 0.5
 
 
 def test_matrices_that_follow_the_step():
@@ -210,7 +210,9 @@ def test_matrices_that_follow_the_step():
     )
     u = np.full((5, 1), 2.0)
     position = 1.0 + 3.0 * t + t**2
-    est = hw.estimate(model, hw.Record(t, np.where(t == 0.6, np.nan, position)[:, None], u), BatchLP()).check()
+    est = hw.estimate(
+        model, hw.Record(t, np.where(t == 0.6, np.nan, position)[:, None], u), BatchLP(point="least_squares")
+    ).check()
     np.testing.assert_allclose(est.x[:, 0], position, atol=1e-7)
     np.testing.assert_allclose(est.x[:, 1], 3.0 + 2.0 * t, atol=1e-6)
 
@@ -256,8 +258,8 @@ def test_units_of_each_state_and_output_do_not_matter(seed, scales):
         e=hw.Uniform.unknown(0.0, 50.0 * k),
         bounds=hw.Box(d * m.bounds.lo, d * m.bounds.hi),
     )
-    one = hw.estimate(m, record, BatchLP()).check()
-    two = hw.estimate(other, hw.Record(record.t, k * record.y, record.u), BatchLP()).check()
+    one = hw.estimate(m, record, BatchLP(point="least_squares")).check()
+    two = hw.estimate(other, hw.Record(record.t, k * record.y, record.u), BatchLP(point="least_squares")).check()
     np.testing.assert_allclose(two.x / d, one.x, rtol=1e-6, atol=1e-6 * np.abs(one.x).max())
     assert two.info["objective"] == pytest.approx(one.info["objective"], rel=1e-6)
 
@@ -268,7 +270,7 @@ def test_units_of_each_state_and_output_do_not_matter(seed, scales):
 def test_what_it_refuses():
     unknown = hw.Uniform.unknown(at_most=1.0)
     walk = hw.Linear([[1.0]], None, [[1.0]], unknown, unknown, None)
-    method = BatchLP()
+    method = BatchLP(point="least_squares")
     assert method.refuses(walk) is None
     for change, word in (
         ({"w": hw.Gaussian(1.0)}, "`w` is `Gaussian`"),
@@ -319,7 +321,7 @@ def test_unobservable_state():
     _, record = hw.simulate(
         dataclasses.replace(model, w=hw.Uniform(0.1), e=hw.Uniform(0.2), x0=hw.Box(-1, 1)), None, T=40, seed=1
     )
-    est = hw.estimate(model, record, BatchLP()).check()
+    est = hw.estimate(model, record, BatchLP(point="least_squares")).check()
     assert np.isfinite(est.x).all()
     np.testing.assert_allclose(np.abs(est.info["unobservable"]), [[0.0, 1.0]], atol=1e-9)
     assert any(n == "not observable: hidden" for n in est.info["notes"])
@@ -331,7 +333,7 @@ def test_unobservable_state():
 def test_observable_model_has_no_such_note():
     for T in (2, 3, 40, 1000):
         _, record = drift(T)
-        est = hw.estimate(DRIFT, record, BatchLP()).check()
+        est = hw.estimate(DRIFT, record, BatchLP(point="least_squares")).check()
         assert est.info["unobservable"].shape == (0, 2)
 
 
@@ -344,7 +346,7 @@ def test_what_data_cannot_know_is_said(case):
     T = {"one row": 1, "one row unseen": 1, "nothing seen": 40, "as many rows as states": 2}[case]
     if case == "one row unseen":
         y[:1] = np.nan
-    est = hw.estimate(DRIFT, hw.Record(record.t[:T], y[:T]), BatchLP()).check()
+    est = hw.estimate(DRIFT, hw.Record(record.t[:T], y[:T]), BatchLP(point="least_squares")).check()
     assert est.status is hw.Status.OK
     assert np.isfinite(est.x).all()
     assert np.all(np.r_[est.q, est.r] < 1e-6)
@@ -353,18 +355,18 @@ def test_what_data_cannot_know_is_said(case):
 
 def test_noiseless_data_give_zero_half_widths_and_say_so():
     t = np.arange(40.0)
-    est = hw.estimate(DRIFT, hw.Record(t, (2.0 + 0.5 * t)[:, None]), BatchLP()).check()
+    est = hw.estimate(DRIFT, hw.Record(t, (2.0 + 0.5 * t)[:, None]), BatchLP(point="least_squares")).check()
     assert est.status is hw.Status.OK
     np.testing.assert_allclose(est.x, np.c_[2.0 + 0.5 * t, np.full(40, 0.5)], atol=1e-9)
     assert np.all(np.r_[est.q, est.r] < 1e-9)
-    zeros = hw.estimate(DRIFT, hw.Record(t, np.zeros((40, 1))), BatchLP()).check()
+    zeros = hw.estimate(DRIFT, hw.Record(t, np.zeros((40, 1))), BatchLP(point="least_squares")).check()
     np.testing.assert_allclose(zeros.x, 0.0, atol=1e-12)
 
 
 def test_known_zero_noise_is_an_equation():
     still = dataclasses.replace(DRIFT, w=hw.Uniform(0.0))
     _, record = drift(q=(0.0, 0.0))
-    est = hw.estimate(still, record, BatchLP()).check()
+    est = hw.estimate(still, record, BatchLP(point="least_squares")).check()
     np.testing.assert_allclose(np.diff(est.x[:, 0]), est.x[:-1, 1], atol=1e-7)
     assert est.r[0] <= 0.3 + 1e-6
 
@@ -393,7 +395,7 @@ def test_caps_too_small_name_the_outlier_and_the_inflation(solver):
         model = dataclasses.replace(
             tight, w=hw.Uniform(grown * np.array([0.05, 0.02])), e=hw.Uniform.unknown(at_most=grown * 0.3)
         )
-        assert hw.estimate(model, hw.Record(0.1 * record.t, y), BatchLP()).status.good is good
+        assert hw.estimate(model, hw.Record(0.1 * record.t, y), BatchLP(point="least_squares")).status.good is good
 
 
 def test_several_outliers_give_a_span():
@@ -401,7 +403,7 @@ def test_several_outliers_give_a_span():
     y = record.y.copy()
     y[[10, 25]] += [[4.0], [-5.0]]
     tight = dataclasses.replace(DRIFT, w=hw.Uniform([0.05, 0.02]), e=hw.Uniform(0.3))
-    est = hw.estimate(tight, hw.Record(record.t, y), BatchLP())
+    est = hw.estimate(tight, hw.Record(record.t, y), BatchLP(point="least_squares"))
     assert [c["row"] for c in est.info["conflicts"][:2]] == [25, 10]
     assert "between t = " in est.message
 
@@ -411,12 +413,12 @@ def test_boxes_that_contradict_the_caps():
         DRIFT, w=hw.Uniform.unknown(at_most=0.05), e=hw.Uniform.unknown(at_most=0.5), bounds=(1e3, 2e3)
     )
     _, record = drift()
-    est = hw.estimate(model, record, BatchLP())
+    est = hw.estimate(model, record, BatchLP(point="least_squares"))
     assert est.status is hw.Status.INFEASIBLE
     assert est.info["inflation"] > 100
     assert np.all(est.x >= 1e3)
     nothing = dataclasses.replace(model, w=hw.Uniform(0.0), e=hw.Uniform(0.0))
-    est = hw.estimate(nothing, record, BatchLP())
+    est = hw.estimate(nothing, record, BatchLP(point="least_squares"))
     assert est.status is hw.Status.INFEASIBLE
     assert est.info["inflation"] is None
     assert "grow" not in est.message
@@ -425,7 +427,7 @@ def test_boxes_that_contradict_the_caps():
 def test_caps_grow_until_a_trajectory_fits():
     _, record = drift(seed=4)
     tight = dataclasses.replace(DRIFT, w=hw.Uniform.unknown(at_most=[0.005, 0.002]), e=hw.Uniform.unknown(at_most=0.05))
-    assert hw.estimate(tight, record, BatchLP()).status is hw.Status.INFEASIBLE
+    assert hw.estimate(tight, record, BatchLP(point="least_squares")).status is hw.Status.INFEASIBLE
     est = hw.estimate(tight, record, BatchLP(grow_caps=True)).check()
     factor = est.info["caps_grown"]
     assert np.log2(factor) == np.round(np.log2(factor))
@@ -436,7 +438,7 @@ def test_caps_grow_until_a_trajectory_fits():
         w=hw.Uniform.unknown(at_most=factor / 2 * np.array([0.005, 0.002])),
         e=hw.Uniform.unknown(at_most=factor / 2 * 0.05),
     )
-    assert hw.estimate(less, record, BatchLP()).status is hw.Status.INFEASIBLE
+    assert hw.estimate(less, record, BatchLP(point="least_squares")).status is hw.Status.INFEASIBLE
     wide = hw.estimate(DRIFT, record, BatchLP(grow_caps=True)).check()
     assert wide.info["caps_grown"] == 1.0
     # Known half-widths are facts: they do not grow.
@@ -449,10 +451,10 @@ def test_caps_grow_until_a_trajectory_fits():
 @pytest.mark.parametrize("scale", [1e-12, 1e-6, 1e6, 1e12])
 def test_wild_scales(scale):
     _, record = drift(seed=5)
-    base = hw.estimate(DRIFT, record, BatchLP()).check()
+    base = hw.estimate(DRIFT, record, BatchLP(point="least_squares")).check()
     wide = hw.Uniform.unknown(at_most=100.0 * scale)
     model = dataclasses.replace(DRIFT, w=wide, e=wide)
-    est = hw.estimate(model, hw.Record(record.t, scale * record.y), BatchLP()).check()
+    est = hw.estimate(model, hw.Record(record.t, scale * record.y), BatchLP(point="least_squares")).check()
     assert est.status is hw.Status.OK
     np.testing.assert_allclose(est.x / scale, base.x, rtol=1e-6, atol=1e-6)
 
@@ -464,8 +466,8 @@ def test_states_of_a_million_beside_a_thousandth():
     y = np.cumsum(rng.uniform(-0.1, 0.1, (T, 2)), axis=0) + rng.uniform(-0.3, 0.3, (T, 2))
     free = hw.Uniform.unknown()
     model = hw.Linear(np.eye(2), None, np.eye(2), free, free, None)
-    one = hw.estimate(model, hw.Record(np.arange(T), y), BatchLP()).check()
-    two = hw.estimate(model, hw.Record(np.arange(T), y * unit), BatchLP()).check()
+    one = hw.estimate(model, hw.Record(np.arange(T), y), BatchLP(point="least_squares")).check()
+    two = hw.estimate(model, hw.Record(np.arange(T), y * unit), BatchLP(point="least_squares")).check()
     np.testing.assert_allclose(two.x / unit, one.x, atol=1e-6)
     np.testing.assert_allclose(two.r / unit, one.r, atol=1e-6)
     assert np.all(two.r > 0)
@@ -473,8 +475,8 @@ def test_states_of_a_million_beside_a_thousandth():
 
 def test_positions_far_from_the_origin():
     _, record = drift(seed=6)
-    near = hw.estimate(DRIFT, record, BatchLP()).check()
-    far = hw.estimate(DRIFT, hw.Record(record.t, record.y + 1e7), BatchLP()).check()
+    near = hw.estimate(DRIFT, record, BatchLP(point="least_squares")).check()
+    far = hw.estimate(DRIFT, hw.Record(record.t, record.y + 1e7), BatchLP(point="least_squares")).check()
     np.testing.assert_allclose(far.x - [1e7, 0.0], near.x, atol=1e-6)
     assert far.info["objective"] == pytest.approx(near.info["objective"], rel=1e-6)
 
@@ -482,17 +484,17 @@ def test_positions_far_from_the_origin():
 def test_zero_width_boxes():
     _, record = drift(seed=7)
     fixed = dataclasses.replace(DRIFT, x0=hw.Box([0.5, 0.1], [0.5, 0.1]))
-    est = hw.estimate(fixed, record, BatchLP()).check()
+    est = hw.estimate(fixed, record, BatchLP(point="least_squares")).check()
     np.testing.assert_allclose(est.info["x0"], [0.5, 0.1], atol=1e-12)
     thin = dataclasses.replace(DRIFT, bounds=([-INF, 0.1], [INF, 0.1 + 1e-13]))
-    est = hw.estimate(thin, record, BatchLP()).check()
+    est = hw.estimate(thin, record, BatchLP(point="least_squares")).check()
     assert np.all(np.abs(est.x[:, 1] - 0.1) <= 1e-12)
 
 
 def test_half_widths_on_a_cap_and_on_a_floor_are_named():
     _, record = drift(seed=8)
     model = dataclasses.replace(DRIFT, w=hw.Uniform.unknown(at_least=0.5), e=hw.Uniform.unknown(at_most=0.05))
-    est = hw.estimate(model, record, BatchLP()).check()
+    est = hw.estimate(model, record, BatchLP(point="least_squares")).check()
     notes = " | ".join(est.info["notes"])
     assert "half-width on its floor: q[p]" in notes or "half-width on its floor: q[p], q[v]" in notes
     assert np.all(est.q >= 0.5)
@@ -502,14 +504,14 @@ def test_half_widths_on_a_cap_and_on_a_floor_are_named():
 def test_never_seen_output_is_named_and_costs_nothing():
     two = hw.Linear([[1.0]], None, [[1.0], [1.0]], UNKNOWN, UNKNOWN, None)
     y = np.c_[np.arange(20.0), np.full(20, np.nan)]
-    est = hw.estimate(two, hw.Record(np.arange(20.0), y), BatchLP()).check()
+    est = hw.estimate(two, hw.Record(np.arange(20.0), y), BatchLP(point="least_squares")).check()
     assert "r[y1]" in " ".join(est.info["notes"])
     assert est.r[1] == 0.0
 
 
 def test_info_is_complete():
     model, record, _ = draw(9)
-    est = hw.estimate(model, record, BatchLP())
+    est = hw.estimate(model, record, BatchLP(point="least_squares"))
     info = est.info
     assert set(info["check"]) == {"primal", "dual", "gap", "complementarity"}
     assert info["solver"] == "piqp"
@@ -524,7 +526,7 @@ def test_info_is_complete():
     assert np.all(np.isnan(info["e"][~record.seen]))
     np.testing.assert_array_equal(info["rows"], np.r_[[30.0] * 3, record.seen.sum(axis=0)])
     assert np.all(info["redundancy"] <= info["rows"])
-    assert est.method == "BatchLP()"
+    assert est.method == "BatchLP(point='least_squares')"
 
 
 def test_redundancy_counts_the_degrees_of_freedom():
@@ -565,7 +567,7 @@ def test_small_random_programs_also_of_growing_models_and_of_data_that_fit_exact
         A, C, y = rng.normal(size=(nx, nx)), rng.normal(size=(ny, nx)), rng.normal(size=(T, ny))
         y[rng.random(y.shape) < 0.3] = np.nan
         model = hw.Linear(A, None, C, unknown, unknown, hw.Box(-3, 3), bounds=(-10, 10))
-        est = hw.estimate(model, hw.Record(np.arange(T), y), hw.BatchLP(objective="paper")).check()
+        est = hw.estimate(model, hw.Record(np.arange(T), y), hw.BatchLP(objective="paper", point="optimal")).check()
         np.testing.assert_allclose(est.q.sum() + est.r.sum(), _by_highs(A, C, y, [3] * nx, 10, 5), rtol=1e-5, atol=1e-5)
 
 
@@ -573,7 +575,7 @@ def test_data_that_fit_exactly_outside_of_the_prior():
     unknown = hw.Uniform.unknown(0, 5)
     car = hw.Linear([[1, 1], [0, 1]], None, [[1, 0]], unknown, unknown, hw.Box([-3, -0.1], [3, 0.1]))
     y = 2.0 * np.arange(4.0)
-    est = hw.estimate(car, hw.Record(np.arange(4), y), hw.BatchLP(objective="paper")).check()
+    est = hw.estimate(car, hw.Record(np.arange(4), y), hw.BatchLP(objective="paper", point="optimal")).check()
     best = _by_highs(car.A.single, car.C.single, y[:, None], [3, 0.1], np.inf, 5)
     np.testing.assert_allclose(est.q.sum() + est.r.sum(), best, rtol=1e-5)
     assert best > 1.0

@@ -18,6 +18,8 @@ ESTIMATORS: dict[str, str] = {
     "Runnalls": "loss",
     "BeamSearch": "loss",
     "BatchLP": "map",
+    "SequentialLP": "sequential",
+    "Window": "window",
 }
 
 

@@ -134,6 +134,11 @@ class _LossMethod:
             return (
                 f"`{typed(self)}` needs a component for each of the {modes} modes\nhint: {name}(components={2 * modes})"
             )
+        if loss.unknown_noise and len(loss.groups(model.ny)) > 1:
+            return (
+                f"`{name}` learns the covariance of lost samples of one sensor, and the model has several\n"
+                "hint: learn_noise=False, with noise=... where it is known"
+            )
         if not loss.known:
             if self._rule == _AVERAGE and self._settings["depth"] == 0 and isinstance(loss, Markov):
                 return (

@@ -9,14 +9,14 @@ outputs only. With the logarithm linearised, its maximum is the linear program
 
 Three things are added to the paper. The objective is **scaled**: c_j = N_j / sigma_j with sigma_j the group's noise
 level in a least-squares fit, so that metres and radians can be summed; the paper's plain sum is
-``objective="paper"``. The optimum is a **face**, not a point:
-inside a gap the path is free within the bounds that the worst step anywhere has set; by default the trajectory of
-least squares on that face is returned. And **what cannot be known is said**: half-widths that leave no trace in the
-data, directions of the state that no output sees, and, where bounds contradict the data, the rows that do so and the
-factor by which all half-widths would have to grow.
+``objective="paper"``. The optimum is a **face**, not a point: inside a gap the path is free within the bounds that the
+worst step anywhere has set; by default the interior point stops on its central path, short of that face, and
+``point="least_squares"`` returns the trajectory of least squares on it. And **what cannot be known is said**:
+half-widths that leave no trace in the data, directions of the state that no output sees, and, where bounds contradict
+the data, the rows that do so and the factor by which all half-widths would have to grow.
 
-The half-widths found are the smallest that explain the data, often exactly 0 for one of them, so they are no bounds of
-the noise to come: the estimate has no spread, and `interval` refuses.
+The optimal half-widths are the smallest that explain the data, often exactly 0 for one of them, so they are no bounds
+of the noise to come: the estimate has no spread, and `interval` refuses.
 
 References
 ----------
@@ -46,17 +46,21 @@ from halfwidth.model import Linear, Model
 from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
+from halfwidth.solvers.banded import BANDED, Answer, Chain, Shifted, chain_of
+from halfwidth.solvers.banded import solve as structured
 from halfwidth.solvers.lp import HIGHS, PIQP, Program, Solution, Solver, Verdict, highs, solve
 from halfwidth.spread import Box
 
 _SOLVERS: dict[str, tuple[Solver, ...]] = {
-    "auto": (PIQP, HIGHS),
+    "auto": (BANDED, PIQP, HIGHS),
+    "banded": (BANDED,),
     "piqp": (PIQP,),
     "highs": (HIGHS,),
 }
 # HiGHS can be slow on quadratic programs; without that stage the estimate is still optimal.
 _QUADRATIC: dict[str, tuple[Solver, ...]] = {
     "auto": (PIQP, highs(time_limit=2.0)),
+    "banded": (PIQP,),
     "piqp": (PIQP,),
     "highs": (highs(time_limit=60.0),),
 }
@@ -88,14 +92,16 @@ class BatchLP:
         choice of units. ``"paper"``: ``sum q + sum r`` as printed, which adds metres to radians. ``"log"``: ``sum N_j
         log s_j`` by majorise-minimise from the scaled optimum; it needs ``at_least`` above 0 for every unknown
         half-width, since it has no minimum otherwise.
-    point : {"least_squares", "optimal"}
-        Which trajectory of the optimal face: that of least squares in units of sigma, inside the optimal half-widths
-        widened by 1e-6 of sigma (1e-4 where that leaves too little room); or the one the solver happens to return.
+    point : {"central", "least_squares", "optimal"}
+        ``"central"``: the point of the central path at a relative gap of 0.3, short of the optimum, where states are
+        estimated best. Or a trajectory of the optimal face: that of least squares in units of sigma, inside the
+        optimal half-widths widened by 1e-6 of sigma (1e-4 where that leaves too little room); or the one the solver
+        happens to return.
     grow_caps : bool
         Where the caps ``at_most`` of unknown half-widths leave no trajectory, double them until one fits (step 7 of
         the paper's algorithm); ``info["caps_grown"]`` says how often.
-    solver : {"auto", "piqp", "highs"}
-        "auto" asks PIQP first and HiGHS where its answer does not pass the check.
+    solver : {"auto", "banded", "piqp", "highs"}
+        "auto" asks the structured interior point first, then PIQP and HiGHS where an answer does not pass the check.
 
     Notes
     -----
@@ -105,7 +111,8 @@ class BatchLP:
     ==================  ======================================================================
     x0                  state one step before the first row, (nx,)
     objective           value of the objective
-    check               residuals and gap of the linear program by our own arithmetic, each relative
+    check               residuals and gap of the linear program by our own arithmetic, each relative; of a central
+                        point there is ``gap`` instead, its distance from the optimum
     solver, iterations  who solved it
     w, e                residuals (T, nx) and (T, ny); e is NaN where y is not seen
     sigma               scale of each group, (nx + ny,)
@@ -136,14 +143,14 @@ class BatchLP:
     """
 
     objective: Literal["scaled", "paper", "log"] = "scaled"
-    point: Literal["least_squares", "optimal"] = "least_squares"
+    point: Literal["central", "least_squares", "optimal"] = "central"
     grow_caps: bool = False
-    solver: Literal["auto", "piqp", "highs"] = "auto"
+    solver: Literal["auto", "banded", "piqp", "highs"] = "auto"
 
     def __post_init__(self) -> None:
         for name, allowed in (
             ("objective", ("scaled", "paper", "log")),
-            ("point", ("least_squares", "optimal")),
+            ("point", ("central", "least_squares", "optimal")),
             ("solver", tuple(_SOLVERS)),
         ):
             if getattr(self, name) not in allowed:
@@ -186,9 +193,20 @@ class BatchLP:
         floor, cap = _ends(model)
         # A uniform noise of known half-width q has the standard deviation q / sqrt(3).
         base = reference(rows, model, np.where(floor == cap, floor / math.sqrt(3.0), 0.0))
-        task = _Task.build(rows, base, model)
+        task = _Task.build(rows, base, model, record)
         solvers = _SOLVERS[self.solver]
         info: dict[str, Any] = {"caps_grown": 1.0}
+
+        if self.point == "central" and self.objective != "log":
+            weight = task.weights(self.objective)
+            central = task.central(weight)
+            if central is not None:
+                X, s = task.clipped(central.x.ravel()), np.clip(central.s, floor, np.maximum(cap, floor))
+                info |= task.report(X, s, model, record, self._value(task, s), None)
+                info |= {"solver": central.by, "iterations": central.iterations, "gap": central.gap}
+                if info["notes"]:
+                    info["message"] = "; ".join([Status.OK.value, *info["notes"]])
+                return self._estimate(model, record, X, s, Status.OK, info)
 
         found = self._minimise(task, solvers)
         if found.verdict is Verdict.INFEASIBLE and self.grow_caps:
@@ -208,7 +226,7 @@ class BatchLP:
             return self._estimate(model, record, task.clipped(base.X), None, Status.STALLED, info)
 
         X, s = task.point(found.x), task.half_widths(found.x)
-        if self.point == "least_squares" and np.any(found.x[base.X.size :] > _RELAX[0]):
+        if self.point != "optimal" and np.any(found.x[base.X.size :] > _RELAX[0]):
             for relax in _RELAX:
                 second = solve(task.squares(found.x, relax), _QUADRATIC[self.solver])
                 if second.solved and second.x is not None:
@@ -342,6 +360,8 @@ class _Task:
         Half-widths to be found.
     x_lo, x_hi : (n,) arrays
         Box of X in its own units.
+    chain : Chain or None
+        The same in the user's units, for the structured solver.
     floor, cap : (p,) arrays
         Ends of the half-widths in their own units.
     """
@@ -360,9 +380,10 @@ class _Task:
     x_hi: Array
     floor: Array
     cap: Array
+    chain: Chain | None
 
     @classmethod
-    def build(cls, rows: Residuals, base: Reference, model: Linear) -> "_Task":
+    def build(cls, rows: Residuals, base: Reference, model: Linear, record: Record) -> "_Task":
         """Scale the rows, boxes, floors and caps."""
         import scipy.sparse as sp
 
@@ -394,6 +415,7 @@ class _Task:
             x_hi,
             floor,
             cap,
+            chain_of(model, record, np.ones_like(floor), floor, cap),
         )
 
     def weights(self, objective: str) -> Array:
@@ -422,6 +444,7 @@ class _Task:
         known = self.S[two] @ self.lowest
         none = np.full(one.size, np.inf)
         return Program(
+            chain=self.shifted(weight),
             c=np.r_[np.zeros(n), weight],
             G=sp.csr_array(
                 sp.vstack(
@@ -438,6 +461,24 @@ class _Task:
             hi=np.r_[self.hi, top],
             floor=1e-3,
         )
+
+    def shifted(self, weight: Array) -> Shifted | None:
+        """Return the program as a chain in time and where its variables stand to ours; None if it is no chain."""
+        if self.chain is None:
+            return None
+        sigma = self.base.sigma
+        top = np.where(self.free, self.highest, self.lowest)
+        chain = replace(self.chain, c=weight / sigma, floor=self.lowest * sigma, cap=top * sigma)
+        known = ~self.free[self.rows.group]
+        return Shifted(chain, self.base.X, self.base.column, sigma, known)
+
+    def central(self, weight: Array) -> Answer | None:
+        """Return the central point of the program, or None where the structured solver has none."""
+        shifted = self.shifted(weight)
+        if shifted is None or not self.free.any():
+            return None
+        answer = structured(shifted.chain, point="central", fallback=False)
+        return answer if answer.status is Status.OK else None
 
     def squares(self, v: Array, relax: float) -> Program:
         """Return the quadratic program of least squares inside the optimal half-widths, a little widened."""
@@ -546,10 +587,9 @@ class _Task:
         return np.where(self.free, np.clip(tight, self.floor, self.cap), self.floor)
 
     def report(
-        self, X: Array, s: Array, model: Linear, record: Record, value: float, found: Solution
+        self, X: Array, s: Array, model: Linear, record: Record, value: float, found: Solution | None
     ) -> dict[str, Any]:
         """Return what goes into `info` of a solved record."""
-        assert found.check is not None
         rows, base = self.rows, self.base
         nx, T = rows.nx, rows.T
         rho = rows.at(X)
@@ -576,16 +616,12 @@ class _Task:
         if len(blind):
             involved = np.abs(blind).max(axis=0) > 1e-6
             notes.append("not observable: " + ", ".join(n for n, m in zip(model.names.x, involved, strict=True) if m))
-        return {
+        solved: dict[str, Any] = {}
+        if found is not None and found.check is not None:
+            check = {name: getattr(found.check, name) for name in ("primal", "dual", "gap", "complementarity")}
+            solved = {"check": check, "solver": found.solver, "iterations": found.iterations}
+        return solved | {
             "objective": value,
-            "check": {
-                "primal": found.check.primal,
-                "dual": found.check.dual,
-                "gap": found.check.gap,
-                "complementarity": found.check.complementarity,
-            },
-            "solver": found.solver,
-            "iterations": found.iterations,
             "w": rho[: T * nx].reshape(T, nx),
             "e": e,
             "sigma": base.sigma.copy(),

@@ -1,0 +1,72 @@
+// What goes into and comes out of the linear program of core/banded_ipm.hpp: raw arrays and their shapes.
+#pragma once
+
+#include <cstddef>
+
+namespace hw {
+
+struct LpProblem {
+    int T, n, m;  // rows of the record, states, outputs; states are x_0..x_T, row t links x_t (before) and x_{t+1}
+    int p0, ns;   // unknown parameters theta, half-widths s
+    // Matrices, row-major. X_t says whether X is stacked over time (T, ...) or constant.
+    const double* E;  // (n,n) unit upper triangular; null: identity
+    const double* A;  // (n,n)
+    const double* C;  // (m,n)
+    const double* G;  // (T, n+m, p0) columns of theta, state rows first; null if p0 == 0
+    bool E_t, A_t, C_t;
+    const double* bx;  // (T,n)   B u [+ what a linearisation adds]
+    const double* by;  // (T,m)   F y; unseen entries may hold anything
+    const bool* seen;  // (T,m)
+    const double *lo, *hi;  // (T+1,n) or, if not box_t, (n): bounds of the states; null: none
+    bool box_t;
+    const double *x0_lo, *x0_hi;        // (n) bounds of x_0 alone, instead of lo, hi there; null: none
+    const double *theta_lo, *theta_hi;  // (p0)
+    const int* group;                   // (n+m) which half-width bounds rows of this kind
+    const double* h;                    // (n+m) |rho| <= h s
+    const double *c, *floor, *cap;      // (ns) cost, floor and cap of each half-width
+    const double* slack;                // (n+m) cost of a row's own slack; null: no slacks
+};
+
+enum LpPoint { lp_optimal = 0, lp_central = 1, lp_least_squares = 2 };
+enum LpStatus { lp_ok = 0, lp_reduced = 1, lp_infeasible = 2, lp_stalled = 3 };
+
+struct LpSettings {
+    int point = lp_central;
+    double tol = 1e-9;       // relative gap asked of the optimal point
+    double central_gap = 0.3;  // relative gap at which the central point stops
+    int max_iter = 100;
+    bool warm = false;       // start from x, theta, s and lam as given
+    int refine = 2;          // most steps of iterative refinement
+};
+
+struct LpInfo {
+    double objective, gap, dual_residual, primal_residual, violation, scale;
+    int iterations, status;
+};
+
+struct LpOut {
+    double* x;      // (T+1, n)
+    double* theta;  // (p0)
+    double* s;      // (ns)
+    double* lam;    // (T, n+m, 2) multipliers of s - rho >= 0 and s + rho >= 0, or null
+    double* slack;  // (T, n+m) or null
+    LpInfo info;
+};
+
+// A window sliding over one record: at row t the problem of rows start[t]..t is solved.
+struct LpWindows {
+    LpProblem whole;     // of the whole record; x0_lo, x0_hi bound the state before its first row
+    const int* start;    // (T) first row of each window
+    int memory;          // a state's interval is that of its estimates from the next `memory` windows
+    double carry;        // kappa with which a finished interval bounds the state a window starts from; 0: not
+    double* filtered;    // (T, n)  newest state of each window
+    double* smoothed;    // (T+1, n)  last estimate of each state
+    double* s;           // (T, ns)
+    double *low, *high;  // (T+1, n)  least and largest estimate of each state by the windows that end within `memory`
+    int* status;         // (T)
+    int* iterations;     // (T)
+    double* seconds;     // (T)
+    double* scratch;     // (longest window + 1) n + 2 n
+};
+
+}  // namespace hw

@@ -1,0 +1,493 @@
+"""SequentialLP: states, half-widths and unknown model entries, by linear programs about the last estimate.
+
+Unknown entries theta of A, B, C, E, F multiply unknown states, and a nonlinear model bends them: either way a row is no
+longer linear in what is sought. It is linearised about the newest estimate,
+
+    E x  ~  E^ x + (E - E^) x^,        g(x)  ~  g(x^) + g_x (x - x^),
+
+which makes the problem the linear program of known matrices with a few dense columns for theta. Its solution is the
+next point; a step that does not lower the true objective ``sum c_j max|rho_j|`` is shortened. Bounds of theta hold
+throughout. A parameter may **drift**: it is then a straight line over the record, whose end is reported and whose total
+change is bounded.
+
+``Window(SequentialLP(rounds=1), memory)`` is the on-line LSU estimator of the paper: one linear program a row, about
+the last window's estimate.
+
+References
+----------
+Pavelková and Kárný (2013), eqs. (11), (12), (24)-(26), appendix A.2; the sign of the block that F's entries enter with
+is corrected (the coefficient of ``F[k, j]`` in row k is ``-y[j]``).
+"""
+
+import dataclasses
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from halfwidth.array import Array
+from halfwidth.errors import BadValue
+from halfwidth.methods._protocol import typed
+from halfwidth.methods._residuals import reference, residuals
+from halfwidth.model import Entry, Linear, Model, Nonlinear
+from halfwidth.noise import Gaussian, Uniform
+from halfwidth.record import Record
+from halfwidth.result import Estimate, Status
+from halfwidth.solvers.banded import Answer, Chain, chain_of, solve
+from halfwidth.spread import Box, Normal
+
+#: Shares of a step that are tried, the whole one first.
+_STEPS = (1.0, 0.5, 0.25, 0.1, 0.03)
+#: Rounds in which the scale of each group is found for a nonlinear model.
+_SCALINGS = 3
+#: A scale stays above this share of the cap (or of the first residuals): a smooth fit must not make one vanish.
+_LEAST = 0.03
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequentialLP:
+    """States, half-widths and theta by a sequence of linear programs.
+
+    Parameters
+    ----------
+    objective : {"scaled", "paper"}
+        ``sum N_j s_j / sigma_j`` with the noise level sigma_j of a least-squares fit, or the paper's ``sum s_j``.
+    point : {"central", "optimal"}
+        Central points follow the central path to a relative gap of 0.3; they estimate better than optimal ones.
+    rounds : int
+        Most linearisations.
+    tol : float
+        Relative decrease of the objective below which to stop.
+    drift : float or None
+        Largest change of each theta over the record; None keeps it constant.
+    theta : tuple of float or None
+        Where to start; 0 moved into the bounds if absent.
+
+    Raises
+    ------
+    BadValue
+        If a setting is not one of those above.
+
+    Examples
+    --------
+    >>> import halfwidth as hw
+    >>> small = hw.Uniform.unknown(at_most=1.0)
+    >>> decay = hw.Linear([[float("nan")]], None, [[1]], small, small, None, theta_bounds=(0.0, 1.0))
+    >>> record = hw.Record(range(20), [0.9**k for k in range(20)])
+    >>> hw.estimate(decay, record, hw.SequentialLP(point="optimal")).theta.round(3)
+    array([0.9])
+    """
+
+    objective: Literal["scaled", "paper"] = "scaled"
+    point: Literal["central", "optimal"] = "central"
+    rounds: int = 30
+    tol: float = 1e-4
+    drift: float | None = None
+    theta: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("objective", ("scaled", "paper")), ("point", ("central", "optimal"))):
+            if getattr(self, name) not in allowed:
+                raise BadValue(f"`{name}` is {getattr(self, name)!r}, one of {', '.join(allowed)} was expected")
+        if self.rounds < 1:
+            raise BadValue(f"`rounds` is {self.rounds!r}, a positive number was expected")
+        if self.drift is not None and not self.drift > 0:
+            raise BadValue(f"`drift` is {self.drift!r}, a positive number or None was expected")
+
+    def refuses(self, model: Model) -> str | None:
+        """Return why the model cannot be taken, or None."""
+        for name, noise in (("w", model.w), ("e", model.e)):
+            if not isinstance(noise, Uniform):
+                return (
+                    f"`SequentialLP` needs uniform noise but `{name}` is `{type(noise).__name__}`"
+                    f"\nhint: {name}=Uniform.unknown(at_most=...)"
+                )
+        if model.loss is not None:
+            return (
+                "`SequentialLP` takes lost outputs as NaN in the record but the model has a hidden loss"
+                "\nhint: loss=None"
+            )
+        if isinstance(model, Linear):
+            if not isinstance(model.x0, Box):
+                return "`SequentialLP` needs a box as prior but `x0` is `Normal`\nhint: x0=Box(lo, hi), or None"
+            unknown = {entry.matrix for entry in model.theta_entries}
+            moving = [name for name in unknown if not model.matrices[name].constant]
+            if moving:
+                return f"`SequentialLP` needs constant matrices where entries are unknown but `{moving[0]}` moves"
+        if self.theta is not None and len(self.theta) != len(getattr(model, "theta_entries", ())):
+            return f"`theta` has {len(self.theta)} entries, the model has {len(getattr(model, 'theta_entries', ()))}"
+        return None
+
+    def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
+        """Estimate states, half-widths and theta of one record."""
+        rows = rows_of(model, record, self.drift)
+        theta = start_theta(rows, self.theta)
+        x = rows.start(theta)
+        c = np.ones(rows.groups) if self.objective == "paper" else rows.weights(x, theta)
+        best = rows.worth(x, theta, c)
+        status, answer = Status.STALLED, None
+        history = [best]
+        for _ in range(self.rounds):
+            answer = solve(rows.chain(x, theta, c), point=self.point)
+            status = answer.status
+            if not status.good:
+                break
+            for share in _STEPS:
+                x_new, theta_new = x + share * (answer.x - x), theta + share * (answer.theta - theta)
+                value = rows.worth(x_new, theta_new, c)
+                # The first point comes from least squares, which a central point need not beat.
+                if value < best or (len(history) == 1 and value < 2.0 * best):
+                    break
+            else:
+                break
+            x, theta, gain, best = x_new, theta_new, best - value, value
+            history.append(value)
+            if abs(gain) <= self.tol * max(abs(value), 1e-300) and len(history) > 2:
+                break
+        return finished(self, model, record, rows, x, theta, c, status, answer, history)
+
+
+class LinearRows:
+    """The rows of a linear model, linearised in theta; made by `rows_of`."""
+
+    def __init__(self, model: Linear, record: Record, drift: float | None) -> None:
+        self.model, self.record, self.drift = model, record, drift
+        self.entries: tuple[Entry, ...] = model.theta_entries
+        self.nx, self.ny = model.nx, model.ny
+        self.groups = model.nx + model.ny
+        n = len(self.entries)
+        box = model.theta_bounds if model.theta_bounds is not None else Box(np.full(n, -np.inf), np.full(n, np.inf))
+        self.lo, self.hi = np.broadcast_to(box.lo, n).astype(float), np.broadcast_to(box.hi, n).astype(float)
+        # Rows whose F has an unknown or known entry at an unseen output are bounded by nothing we know.
+        self.known = filled(model, np.zeros(n))
+        seen = record.seen
+        y = np.where(seen, record.y, 0.0)
+        pattern = np.eye(self.ny, dtype=bool)
+        if model.F is not None:
+            single = model.F.single if model.F.constant else np.ones((self.ny, self.ny))
+            pattern = np.isnan(single) | (single != 0)
+        whole = np.where(seen, True, ~(pattern[None] & ~seen[:, None, :]).any(axis=2)) & seen
+        if model.F is not None:
+            whole &= ~(pattern[None] & ~seen[:, None, :]).any(axis=2)
+        self.y = y
+        self.clean = Record(record.t, np.where(whole, y, np.nan), record.u)
+        self.floor, self.cap = half_width_bounds(model)
+        if drift is not None and n:
+            # The line's slope is one more parameter each, in units of change over the record.
+            self.lo = np.r_[self.lo, np.full(n, -drift)]
+            self.hi = np.r_[self.hi, np.full(n, drift)]
+        full = chain_of(self.known, Record(record.t, y, record.u), np.ones(self.groups), self.floor, self.cap)
+        assert full is not None
+        self.base = replace(full, seen=np.ascontiguousarray(whole))
+
+    def matrices(self, theta: Array) -> dict[str, Array]:
+        """Return the matrices that hold unknown entries, filled."""
+        found: dict[str, Array] = {}
+        for entry, value in zip(self.entries, theta, strict=False):
+            if entry.matrix not in found:
+                found[entry.matrix] = np.where(
+                    np.isnan(self.model.matrices[entry.matrix].single), 0.0, self.model.matrices[entry.matrix].single
+                )
+            found[entry.matrix][entry.row, entry.column] = value
+        return found
+
+    def columns(self, x: Array, a: int = 0, b: int | None = None) -> Array:
+        """Return the derivative of rows a to b by theta at states x (rows + 1, nx): (rows, groups, p)."""
+        y, u = self.y[a:b], None if self.record.u is None else self.record.u[a:b]
+        G = np.zeros((len(y), self.groups, len(self.lo)))
+        for k, (name, i, j) in enumerate(self.entries):
+            if name == "A":
+                G[:, i, k] = -x[:-1, j]
+            elif name == "B" and u is not None:
+                G[:, i, k] = -u[:, j]
+            elif name == "C":
+                G[:, self.nx + i, k] = x[1:, j]
+            elif name == "E":
+                G[:, i, k] = x[1:, j]
+            elif name == "F":
+                G[:, self.nx + i, k] = -y[:, j]
+        if self.drift is not None and self.entries:
+            n = len(self.entries)
+            age = np.linspace(-1.0, 0.0, len(y)) if len(y) > 1 else np.zeros(1)
+            G[:, :, n:] = G[:, :, :n] * age[:, None, None]
+        return G
+
+    def chain(self, x: Array, theta: Array, c: Array, a: int = 0, b: int | None = None) -> Chain:
+        """Return the linear program about (x, theta), of rows a to b."""
+        T = len(self.record)
+        part = self.base if a == 0 and b in (None, T) else self.base.part(a, T if b is None else b)
+        if not self.entries:
+            return replace(part, c=c)
+        n = len(self.entries)
+        new = self.matrices(theta[:n])
+        G = self.columns(x, a, b)
+        u = None if self.record.u is None else self.record.u[a:b]
+        bx, by = part.bx, part.by
+        if "B" in new and u is not None:
+            bx = u @ new["B"].T
+        if "F" in new:
+            by = self.y[a:b] @ new["F"].T
+        at = G[:, :, :n] @ theta[:n]  # the drift is measured from theta itself
+        return replace(
+            part,
+            A=np.ascontiguousarray(new.get("A", part.A)),
+            C=np.ascontiguousarray(new.get("C", part.C)),
+            E=np.ascontiguousarray(new["E"]) if "E" in new else part.E,
+            bx=np.ascontiguousarray(bx + at[:, : self.nx]),
+            by=np.ascontiguousarray(by + at[:, self.nx :]),
+            G=G,
+            theta_lo=self.lo,
+            theta_hi=self.hi,
+            c=c,
+        )
+
+    def residuals(self, x: Array, theta: Array) -> Array:
+        """Return the true residuals (T, groups), NaN where no row is."""
+        n = len(self.entries)
+        one = self.chain(x, theta, np.ones(self.groups))
+        A, C = one.A, one.C
+        rho = np.empty((one.T, self.groups))
+        E = np.eye(self.nx) if one.E is None else one.E
+        rho[:, : self.nx] = (E @ x[1:, :, None] - A @ x[:-1, :, None])[..., 0] - one.bx
+        rho[:, self.nx :] = np.where(one.seen, (C @ x[1:, :, None])[..., 0] - one.by, np.nan)
+        if one.G is not None:
+            full = theta if self.drift is not None else theta[:n]
+            rho += one.G @ full
+        return rho
+
+    def worth(self, x: Array, theta: Array, c: Array) -> float:
+        """Return ``sum c_j max|rho_j|``."""
+        return float(c @ largest(self.residuals(x, theta), self.floor))
+
+    def start(self, theta: Array) -> Array:
+        """Return the least-squares trajectory at theta."""
+        fixed = filled(self.model, theta[: len(self.entries)])
+        chain = chain_of(fixed, self.clean, np.ones(self.groups), self.floor, self.cap)
+        assert chain is not None
+        return solve(chain, point="least_squares", fallback=False).x
+
+    def weights(self, x: Array, theta: Array) -> Array:  # noqa: ARG002
+        """Return N_j / sigma_j of each group."""
+        fixed = filled(self.model, theta[: len(self.entries)])
+        known = np.where(self.floor == self.cap, self.floor / np.sqrt(3.0), 0.0)
+        base = reference(residuals(fixed, self.clean), fixed, known)
+        return scaled_costs(np.r_[np.full(self.nx, len(self.record)), self.base.seen.sum(axis=0)], base.sigma)
+
+
+class NonlinearRows:
+    """The rows of a nonlinear model, linearised about a trajectory; made by `rows_of`."""
+
+    def __init__(self, model: Nonlinear, record: Record) -> None:
+        self.model, self.record = model, record
+        self.nx, self.ny = model.nx, model.ny
+        self.groups = model.nx + model.ny
+        self.entries: tuple[Entry, ...] = ()
+        self.drift = None
+        self.lo = self.hi = np.zeros(0)
+        self.floor, self.cap = half_width_bounds(model)
+        self.y = np.where(record.seen, record.y, 0.0)
+        self.dt = record.steps(model.dt)
+
+    def _along(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        T = len(self.record)
+        g, h = np.empty((T, self.nx)), np.empty((T, self.ny))
+        g_x, h_x = np.empty((T, self.nx, self.nx)), np.empty((T, self.ny, self.nx))
+        for k in range(T):
+            u = None if self.record.u is None else self.record.u[k]
+            before = self.model.linearise(x[k], u, float(self.dt[k]))
+            after = self.model.linearise(x[k + 1], u, float(self.dt[k]))
+            g[k], g_x[k], h[k], h_x[k] = before.g, before.g_x, after.h, after.h_x
+        return g, g_x, h, h_x
+
+    def _wrapped(self, difference: Array, angles: tuple[int, ...]) -> Array:
+        if angles:
+            k = list(angles)
+            difference[:, k] = (difference[:, k] + np.pi) % (2 * np.pi) - np.pi
+        return difference
+
+    def chain(self, x: Array, theta: Array, c: Array) -> Chain:  # noqa: ARG002
+        """Return the linear program about x."""
+        g, g_x, h, h_x = self._along(x)
+        box, x0 = self.model.bounds, self.model.x0
+        lo, hi = x0.interval(0.9999) if isinstance(x0, Normal) else (x0.lo, x0.hi)
+        # Residuals as they are at x, wrapped where they are angles, then moved along the tangent.
+        w = self._wrapped(x[1:] - g, self.model.x_angles)
+        e = self._wrapped(h - self.y, self.model.y_angles)
+        tangent = (g_x @ x[:-1, :, None])[..., 0]
+        return Chain(
+            A=g_x,
+            C=h_x,
+            bx=np.ascontiguousarray(x[1:] - tangent - w),
+            by=np.ascontiguousarray((h_x @ x[1:, :, None])[..., 0] - e),
+            seen=np.ascontiguousarray(self.record.seen),
+            group=np.arange(self.groups, dtype=np.int32),
+            h=np.ones(self.groups),
+            c=np.array(c, dtype=float),
+            floor=self.floor,
+            cap=self.cap,
+            lo=None if box is None else np.array(box.lo, dtype=float),
+            hi=None if box is None else np.array(box.hi, dtype=float),
+            x0_lo=np.array(lo, dtype=float),
+            x0_hi=np.array(hi, dtype=float),
+        )
+
+    def residuals(self, x: Array, theta: Array) -> Array:  # noqa: ARG002
+        """Return the true residuals (T, groups), NaN where no row is."""
+        T = len(self.record)
+        rho = np.empty((T, self.groups))
+        for k in range(T):
+            u = None if self.record.u is None else self.record.u[k]
+            rho[k, : self.nx] = x[k + 1] - self.model.move(x[k], u, float(self.dt[k]))
+            rho[k, self.nx :] = self.model.output(x[k + 1]) - self.y[k]
+        self._wrapped(rho[:, : self.nx], self.model.x_angles)
+        rho[:, self.nx :] = self._wrapped(rho[:, self.nx :], self.model.y_angles)
+        rho[:, self.nx :][~self.record.seen] = np.nan
+        return rho
+
+    def worth(self, x: Array, theta: Array, c: Array) -> float:
+        """Return ``sum c_j max|rho_j|``."""
+        return float(c @ largest(self.residuals(x, theta), self.floor))
+
+    def start(self, theta: Array) -> Array:  # noqa: ARG002
+        """Return the trajectory of an extended Kalman smoother with the widest noise that the caps allow."""
+        from halfwidth.methods.nonlinear import ExtendedKalman
+
+        top = np.where(np.isfinite(self.cap), self.cap, 1.0) ** 2 / 3.0
+        x0 = self.model.x0
+        if isinstance(x0, Box):
+            half = np.where(np.isfinite(x0.hi - x0.lo), 0.5 * (x0.hi - x0.lo), 1e3)
+            x0 = Normal(x0.mean, np.diag(np.maximum(half, 1e-9) ** 2 / 3.0))
+        gaussian = dataclasses.replace(
+            self.model, w=Gaussian(np.diag(top[: self.nx])), e=Gaussian(np.diag(top[self.nx :])), x0=x0, bounds=None
+        )
+        method = ExtendedKalman(smooth=True)
+        found = method.run(gaussian, self.record)
+        first = np.asarray(found.info.get("x0", x0.mean), dtype=float)
+        x = np.vstack([first, found.x])
+        if not np.isfinite(x).all():
+            x = np.tile(x0.mean, (len(self.record) + 1, 1))
+        return x if self.model.bounds is None else np.clip(x, self.model.bounds.lo, self.model.bounds.hi)
+
+    def weights(self, x: Array, theta: Array) -> Array:
+        """Return N_j / sigma_j with the noise level of a least-squares fit about x."""
+        count = np.r_[np.full(self.nx, len(self.record)), self.record.seen.sum(axis=0)].astype(float)
+        sigma = np.where(np.isfinite(self.cap), self.cap, np.nanstd(self.residuals(x, theta), axis=0) + 1e-12)
+        least = _LEAST * sigma
+        for _ in range(_SCALINGS):
+            chain = self.chain(x, theta, 1.0 / np.maximum(sigma, 1e-300))
+            smooth = solve(chain, point="least_squares", fallback=False).x
+            rho = chain_residuals(chain, smooth)
+            level = np.sqrt(np.nanmean(np.where(np.isnan(rho), 0.0, rho) ** 2, axis=0))
+            sigma = np.maximum(level, least)
+        return scaled_costs(count, sigma)
+
+
+Rows = LinearRows | NonlinearRows
+
+
+def rows_of(model: Model, record: Record, drift: float | None = None) -> Rows:
+    """Return the rows of a model over a record, ready to be linearised."""
+    return LinearRows(model, record, drift) if isinstance(model, Linear) else NonlinearRows(model, record)
+
+
+def filled(model: Linear, theta: Array) -> Linear:
+    """Return the model with its unknown entries set to theta."""
+    entries = model.theta_entries
+    if not entries:
+        return model
+    new: dict[str, Any] = {}
+    for entry, value in zip(entries, theta, strict=True):
+        if entry.matrix not in new:
+            new[entry.matrix] = model.matrices[entry.matrix].single.copy()
+        new[entry.matrix][entry.row, entry.column] = value
+    return dataclasses.replace(model, **new, theta_bounds=None)
+
+
+def start_theta(rows: Rows, given: tuple[float, ...] | None) -> Array:
+    """Return the first theta: as given, or 0, moved into its bounds; drifts start at 0."""
+    theta = np.zeros(len(rows.lo))
+    if given is not None:
+        theta[: len(given)] = given
+    return np.clip(theta, rows.lo, rows.hi)
+
+
+def half_width_bounds(model: Model) -> tuple[Array, Array]:
+    """Return floors and caps of (q, r)."""
+    assert isinstance(model.w, Uniform)
+    assert isinstance(model.e, Uniform)
+    return (
+        np.r_[np.broadcast_to(model.w.at_least, model.nx), np.broadcast_to(model.e.at_least, model.ny)].astype(float),
+        np.r_[np.broadcast_to(model.w.at_most, model.nx), np.broadcast_to(model.e.at_most, model.ny)].astype(float),
+    )
+
+
+def largest(rho: Array, floor: Array) -> Array:
+    """Return the largest |rho| of each group, at least its floor."""
+    top = np.max(np.where(np.isnan(rho), 0.0, np.abs(rho)), axis=0, initial=0.0)
+    return np.asarray(np.maximum(top, floor))
+
+
+def scaled_costs(count: Array, sigma: Array) -> Array:
+    """Return N_j / sigma_j over the mean count; of a group without rows 1 / sigma_j."""
+    count = np.asarray(count, dtype=float)
+    mean = float(count[count > 0].mean()) if np.any(count > 0) else 1.0
+    return np.where(count > 0, count / mean, 1.0) / np.where(sigma > 0, sigma, 1.0)
+
+
+def chain_residuals(chain: Chain, x: Array) -> Array:
+    """Return the residuals (T, nx + ny) of a chain without theta at x, NaN where no row is."""
+    E = np.eye(x.shape[1]) if chain.E is None else chain.E
+    w = (E @ x[1:, :, None] - chain.A @ x[:-1, :, None])[..., 0] - chain.bx
+    e = np.where(chain.seen, (chain.C @ x[1:, :, None])[..., 0] - chain.by, np.nan)
+    return np.hstack([w, e])
+
+
+def finished(
+    method: SequentialLP,
+    model: Model,
+    record: Record,
+    rows: Rows,
+    x: Array,
+    theta: Array,
+    c: Array,
+    status: Status,
+    answer: Answer | None,
+    history: list[float],
+) -> Estimate:
+    """Return the estimate at (x, theta)."""
+    rho = rows.residuals(x, theta)
+    s = largest(rho, rows.floor)
+    over = s > rows.cap * (1.0 + 1e-6)
+    notes = []
+    if over.any() and status.good:
+        status = Status.REDUCED
+        notes.append("the linearisation leaves residuals beyond the caps")
+    n = len(rows.entries)
+    info: dict[str, Any] = {
+        "x0": x[0].copy(),
+        "objective": float(c @ s),
+        "rounds": len(history) - 1,
+        "history": history,
+        "w": rho[:, : rows.nx],
+        "e": -rho[:, rows.nx :],
+        "notes": notes,
+        "iterations": 0 if answer is None else answer.iterations,
+        "solver": "banded" if answer is None else answer.by,
+    }
+    if method.drift is not None and n:
+        info["drift"] = theta[n:].copy()
+    if notes:
+        info["message"] = "; ".join([status.value, *notes])
+    return Estimate(
+        record.t,
+        x[1:].copy(),
+        None,
+        status,
+        typed(method),
+        q=np.minimum(s, rows.cap)[: rows.nx] if status.good else None,
+        r=np.minimum(s, rows.cap)[rows.nx :] if status.good else None,
+        theta=theta[:n].copy() if n else None,
+        names=model.names.x,
+        labels=record.labels,
+        info=info,
+    )

@@ -1,0 +1,162 @@
+"""Sliding windows: what they see, what they say, and that the online form is the same."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import halfwidth as hw
+from halfwidth.methods.window import rows_since_fix, window_starts
+from halfwidth.reproduce import paper003
+
+UNKNOWN = hw.Uniform.unknown(at_most=10.0)
+H = 0.1
+CART = hw.Linear([[1, H], [0, 1]], [[H * H / 2], [H]], [[1, 0]], UNKNOWN, UNKNOWN, None, dt=H)
+
+
+def cart(T, seed=0, q=(0.002, 0.005), r=0.3):
+    true = dataclasses.replace(CART, w=hw.Uniform(q), e=hw.Uniform(r), x0=hw.Box([0, 0], [0, 0]))
+    return hw.simulate(true, np.sin(np.arange(T) / 30), seed=seed)
+
+
+def test_a_window_is_the_batch_on_its_rows():
+    _, record = cart(60)
+    method = hw.BatchLP(objective="paper", point="optimal")
+    est = hw.estimate(CART, record, hw.Window(method, memory=10)).check()
+    for t in (0, 5, 20, 59):
+        a = max(0, t - 10)
+        part = hw.Record(record.t[a : t + 1], record.y[a : t + 1], record.u[a : t + 1])
+        alone = hw.estimate(CART, part, method)
+        assert est.info["q"][t].sum() + est.info["r"][t].sum() == pytest.approx(
+            alone.info["objective"], rel=1e-6, abs=1e-9
+        )
+
+
+def test_the_general_way_and_the_fast_way_agree():
+    _, record = cart(40)
+    method = hw.BatchLP(objective="paper", point="optimal")
+    window = hw.Window(method, memory=8)
+    fast = window.run(CART, record)
+    slow = window._any(CART, record, fast.info["start"], None)
+    np.testing.assert_allclose(
+        fast.info["q"].sum(axis=1) + fast.info["r"].sum(axis=1), slow.s.sum(axis=1), rtol=1e-6, atol=1e-9
+    )
+
+
+def test_windows_stretch_until_every_output_has_fixes():
+    seen = np.ones((40, 2), bool)
+    seen[10:30, 0] = False
+    seen[:, 1] = np.arange(40) % 7 == 0
+    start = window_starts(seen, 5, fixes=3)
+    for t in range(40):
+        held = seen[start[t] : t + 1].sum(axis=0)
+        before = seen[: t + 1].sum(axis=0)
+        assert np.all(held >= np.minimum(3, before))
+        assert start[t] <= max(0, t - 5)
+    assert np.all(np.diff(start) >= 0)
+    np.testing.assert_array_equal(window_starts(seen, 5, fixes=0), np.maximum(0, np.arange(40) - 5))
+    assert np.all(np.arange(40) - window_starts(seen, 5, stretch=8) < 8)
+    np.testing.assert_array_equal(rows_since_fix(np.array([[False], [True], [False], [False]])), [1, 0, 1, 2])
+
+
+def test_an_outage_longer_than_the_memory():
+    """60 s at 10 Hz with a memory of 25 rows: completes, says that it extrapolates, and takes up again."""
+    truth, record = cart(1000, seed=1)
+    lost = record.without(20.0, 80.0)
+    est = hw.estimate(CART, lost, hw.Window(hw.BatchLP(), memory=25)).check()
+    out = est.info["extrapolated"]
+    np.testing.assert_array_equal(out, ~lost.seen[:, 0])
+    assert "extrapolate" in est.message
+    error = np.abs(est.x - truth.x)[:, 0]
+    back = np.flatnonzero(out)[-1] + 1
+    assert error[back + 30 :].mean() < 0.1
+    # The jump on re-acquisition stays within what the half-widths seen before the outage allow to build up.
+    first = np.flatnonzero(out)[0]
+    q = est.info["q"][first - 25 : first].max(axis=0)
+    n = back - first + 1
+    state = np.abs(np.diff(est.info["smoothed"][first - 25 : first, 1])).max()
+    allowed = n * q[0] + 0.5 * H * n * n * q[1] + n * H * state + 2 * 0.3
+    assert abs(est.x[back, 0] - est.x[back - 1, 0]) <= allowed
+
+
+def test_stream_follows_the_batch_and_resumes():
+    _, record = cart(80)
+    lost = record.without(3.0, 5.0)
+    window = hw.Window(hw.BatchLP(objective="paper", point="optimal"), memory=10)
+    est = hw.estimate(CART, lost, window)
+    live = hw.stream(CART, window)
+    for t in range(50):
+        newest = live.push(lost.y[t], lost.u[t])
+        assert newest.info["extrapolated"] == est.info["extrapolated"][t]
+        assert newest.q.sum() + newest.r.sum() == pytest.approx(
+            est.info["q"][t].sum() + est.info["r"][t].sum(), rel=1e-6, abs=1e-9
+        )
+    assert newest.x.shape == (1, 2)
+
+
+def test_unknown_entries_on_line():
+    drawn = paper003.draw(0, rows=300)
+    est = hw.estimate(
+        paper003.system(unknown=True), drawn.record, hw.Window(hw.SequentialLP(rounds=1, objective="paper"), memory=25)
+    ).check()
+    assert est.theta.shape == (4,)
+    assert np.all((est.info["theta"][30:] >= 0) & (est.info["theta"][30:] <= 1))
+    assert abs(np.mean(est.info["theta"][30:, 3]) - 0.4) < 0.2
+    assert np.abs(est.x - drawn.x)[30:].mean() < 0.1
+
+
+def test_ensemble_interval():
+    drawn = paper003.draw(0, correlated=False, rows=300)
+    model = paper003.system(unknown=False, correlated=False)
+    est = paper003.lsu(drawn, 25, model)
+    lo, hi = hw.ensemble_interval(est, kappa=2.0)
+    narrow = hw.ensemble_interval(est, kappa=1.0)
+    done = slice(0, 300 - 25)
+    assert np.all(hi[done] >= lo[done])
+    np.testing.assert_allclose((hi - lo)[done], 2 * (narrow[1] - narrow[0])[done])
+    inside = (drawn.x[done] >= lo[done]) & (drawn.x[done] <= hi[done])
+    assert inside.mean() > 0.8
+    assert np.isnan(lo[-1]).all()
+    with pytest.raises(hw.Refused):
+        hw.ensemble_interval(hw.estimate(model, drawn.record, hw.BatchLP()))
+
+
+def test_carry_bounds_the_first_state():
+    drawn = paper003.draw(0, correlated=False, rows=200)
+    model = paper003.system(unknown=False, correlated=False)
+    free = hw.Window(hw.BatchLP(point="optimal"), memory=10).run(model, drawn.record)
+    held = hw.Window(hw.BatchLP(point="optimal"), memory=10, carry=3.0).run(model, drawn.record).check()
+    width = [np.mean((e.info["high"] - e.info["low"])[:-12]) for e in (free, held)]
+    assert width[1] < width[0]
+    assert np.abs(held.x - drawn.x).mean() < 0.12
+
+
+def test_every_window_is_solved():
+    for memory in (5, 25):
+        drawn = paper003.draw(3, correlated=False, rows=1000)
+        est = paper003.lsu(drawn, memory, paper003.system(unknown=False, correlated=False))
+        assert est.info["unsolved"] == []
+
+
+def test_choose_memory():
+    _, record = cart(200)
+    choice = hw.choose_memory(CART, record, memories=(3, 10, 20))
+    assert choice.best in (3, 10, 20)
+    assert np.isfinite(choice.score).all()
+    pytest.importorskip("matplotlib").use("Agg")
+    assert choice.plot() is not None
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"memory": 0}, {"carry": -1.0}, {"fixes": -1}, {"memory": 5, "stretch": 3}, {"method": hw.BatchLP}],
+)
+def test_bad_settings(settings):
+    with pytest.raises(hw.BadValue):
+        hw.Window(**({"method": hw.BatchLP()} | settings))
+
+
+def test_refuses_what_the_method_inside_refuses():
+    gaussian = dataclasses.replace(CART, w=hw.Gaussian(1.0), e=hw.Gaussian(1.0))
+    with pytest.raises(hw.Refused, match="uniform"):
+        hw.estimate(gaussian, cart(5)[1], hw.Window(hw.BatchLP()))
