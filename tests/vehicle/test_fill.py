@@ -256,7 +256,7 @@ def test_inflation_is_interpolated_and_never_below_one():
     two = calibrate.Tested(20.0, 9, 1.0, 2.0, 0.6, 3.0)
     factor = calibrate.inflation([one, two], np.array([1.0, 2.0, np.sqrt(40.0), 20.0, 90.0]))
     np.testing.assert_allclose(factor, [1.0, 1.0, np.sqrt(3.0), 3.0, 3.0])
-    np.testing.assert_allclose(calibrate.inflation([], np.array([1.0, 5.0])), 1.0)
+    np.testing.assert_allclose(calibrate.inflation([], np.array([1.0, 5.0])), 2.0)
     np.testing.assert_allclose(calibrate.inflation([one], np.array([1.0]), least=0.0), 0.7)
 
 
@@ -266,9 +266,14 @@ def test_wrong_arguments():
         ({"level": 1.0}, BadValue),
         ({"method": "none"}, BadValue),
         ({"clock_offset": np.inf}, BadValue),
+        ({"level": "a"}, BadValue),
+        ({"level": None}, BadValue),
+        ({"clock_offset": "a"}, BadValue),
+        ({"clock_offset": []}, BadValue),
     ):
-        with pytest.raises(kind):
+        with pytest.raises(kind, match=next(iter(wrong))) as caught:
             fill(log, **wrong)
+        assert caught.value.hint or "method" in wrong
     with pytest.raises(BadLog, match="no fix"):
         fill(Log(t=[0.0, 1.0, 2.0]))
 
@@ -403,3 +408,89 @@ def test_half_widths_that_could_not_be_tested_claim_no_probability():
         columns[name][~np.isin(np.arange(len(made.log)), kept)] = NAN
     assert sound(fill(Log(t=made.t, **columns))).guarantee == "none"
     assert fill(made.log.without(60, 80)).guarantee == "credible"
+
+
+def _hole(log, spans, *names):
+    """The log without its fixes and without the sensors named in some spans of time."""
+    inside = np.any([(log.t >= a) & (log.t <= b) for a, b in spans], axis=0)
+    log = dataclasses.replace(log, **{name: np.where(inside, NAN, getattr(log, name)) for name in names})
+    for a, b in spans:
+        log = log.without(a, b)
+    return log
+
+
+def _against_hidden(log, track, spans):
+    """Errors of hidden fixes, the half-widths there, and the share inside, each axis by itself."""
+    rows = np.flatnonzero(log.fixed & np.any([(log.t >= a) & (log.t <= b) for a, b in spans], axis=0))
+    at, frame = np.searchsorted(track.t_s, log.t[rows]), Frame.of(log)
+    off = np.abs(
+        np.array(frame.to_local(log.lat_deg[rows], log.lon_deg[rows]))
+        - np.array(frame.to_local(track.lat_deg[at], track.lon_deg[at]))
+    )
+    half = np.array([track.east_half_m[at], track.north_half_m[at]])
+    return np.hypot(*off), half, float(np.mean(off <= half))
+
+
+@pytest.mark.parametrize("silent", [("speed_mps",), ("speed_mps", "yaw_rate_radps")])
+def test_where_the_speed_is_lost_with_the_fixes_half_widths_are_of_the_size_of_the_errors(data, silent):
+    log = real_log(data, "driveplotr")
+    spans = [(a, a + 30) for a in np.linspace(60, 900, 8)]
+    track = sound(fill(_hole(log, spans, *silent)))
+    error, half, inside = _against_hidden(log, track, spans)
+    assert inside > 0.85
+    assert half.max() < 3 * error.max()
+    assert any("without speed" in message and "tested on" in message for message in track.messages)
+
+
+def test_a_hole_in_which_nothing_arrives_is_about_as_sure_as_constant_velocity(data):
+    log = real_log(data, "driveplotr")
+    widest = {name: max(gap.max_half_m for gap in fill(log, method=name).gaps) for name in (None, "cv")}
+    assert widest[None] < 2 * widest["cv"]
+
+
+def test_without_a_yaw_rate_one_gap_is_judged_by_others_that_do_not_know_the_way(data):
+    log = real_log(data, "smartloc")
+    bare = dataclasses.replace(log, yaw_rate_radps=np.full(len(log), NAN))
+    shares = []
+    for a in (30, 65, 100, 150, 200):
+        track = sound(fill(bare.without(a, a + 30)))
+        error, half, inside = _against_hidden(log, track, [(a, a + 30)])
+        shares.append(inside)
+        assert error.max() < 4 * half.max()
+    assert np.mean(shares) > 0.85
+
+
+def test_silent_sensors_in_one_gap_do_not_widen_the_others():
+    made = drive(duration=300.0)
+    one = fill(made.log.without(60, 80))
+    both = sound(fill(_hole(made.log.without(60, 80), [(200, 220)], "speed_mps")))
+    near = (one.t_s > 60) & (one.t_s < 80)
+    near_both = (both.t_s > 60) & (both.t_s < 80)
+    assert both.half_m[near_both].max() < 1.5 * one.half_m[near].max()
+    assert both.guarantee == "credible"
+    assert {row["silent"] for row in both.benchmark} == {(), ("speed",)}
+
+
+def test_a_gap_bridged_by_the_other_method_has_no_jumps(monkeypatch):
+    monkeypatch.setattr(sys.modules["halfwidth.vehicle.fill"], "_BETTER", np.inf)
+    made = drive(duration=300.0)
+    track = sound(fill(_hole(made.log, [(100, 120)], "speed_mps", "yaw_rate_radps")))
+    assert any("bridged by cv" in message for message in track.messages)
+    east, north = Frame.of(made.log).to_local(track.lat_deg, track.lon_deg)
+    assert np.hypot(np.diff(east), np.diff(north)).max() < 3.0  # 0.1 s apart
+
+
+def test_untested_half_widths_have_a_floor(data):
+    log = real_log(data, "driveplotr")
+    shares = []
+    for n in (8, 10, 12):
+        keep = np.flatnonzero(log.fixed)[np.linspace(0, log.fixed.sum() - 1, n).astype(int)]
+        lost = ~np.isin(np.arange(len(log)), keep)
+        thin = dataclasses.replace(
+            log, lat_deg=np.where(lost, NAN, log.lat_deg), lon_deg=np.where(lost, NAN, log.lon_deg)
+        )
+        track = sound(fill(thin))
+        assert track.guarantee == "none"
+        assert any("widened 2 times" in message for message in track.messages)
+        shares.append(_against_hidden(log, track, [(log.t[0], log.t[-1])])[2])
+    assert np.mean(shares) > 0.8

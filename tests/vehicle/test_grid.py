@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from tests.vehicle.known import FRAME, known
@@ -100,3 +102,19 @@ def test_one_fix_is_a_grid_and_none_is_not():
     assert grid.seen.sum() == 1
     with pytest.raises(BadLog, match="no fix"):
         sampled(Log(t=t))
+
+
+def test_masking_may_silence_the_sensors_as_a_log_without_them_is():
+    made = known(60.0, rate=5.0)
+    inside = (made.t > 20.1) & (made.t < 29.9)
+    lost = dataclasses.replace(made.log, speed_mps=np.where(inside, np.nan, made.log.speed_mps))
+    real = sampled(lost.without(20.1, 29.9))
+    whole = sampled(made.log)
+    hidden = whole.masked((whole.t > 20.1) & (whole.t < 29.9), ("speed",))
+    np.testing.assert_array_equal(hidden.seen, real.seen)
+    np.testing.assert_array_equal(hidden.speed_sd > 0, real.speed_sd > 0)
+    np.testing.assert_allclose(hidden.speed_sd, real.speed_sd, rtol=0.05, atol=0.05)
+    np.testing.assert_allclose(hidden.speed, real.speed, atol=0.3)
+    np.testing.assert_array_equal(hidden.yaw_rate, whole.yaw_rate)
+    everything = whole.masked(np.ones(len(whole), dtype=bool), ("speed", "yaw_rate"))
+    assert np.isfinite(everything.speed).all()

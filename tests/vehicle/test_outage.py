@@ -76,9 +76,21 @@ def test_what_cannot_be_tried_is_said(log):
     assert "no speed" in table.skipped["gpsins"]
     assert "500 s" in table.skipped
     assert "em: the log has no speed or yaw rate" in str(table)
-    nothing = outages(bare, (500,), 3, 1)
-    assert not nothing.cells
-    assert "no outage could be tried" in str(nothing)
+
+
+def test_an_outage_that_has_no_place_is_an_error_that_says_what_has(log):
+    with pytest.raises(BadValue, match=r"`lengths` is 500 s .* span 150 s.* 1, 2, 5, 10, 20, 30, 60 s can be tried"):
+        outages(log, (500,), 3, 1)
+    standing = Log(t=np.arange(200.0), lat_deg=np.full(200, 50.0), lon_deg=np.full(200, 14.0))
+    with pytest.raises(BadLog, match="no place for an outage"):
+        outages(standing, (5,), 3, 1)
+    with pytest.raises(BadLog, match="`em`: the log has no speed or yaw rate"):
+        outages(standing, (5,), 3, 1, ("em",))
+
+
+def test_the_table_says_that_its_intervals_are_not_widened(table):
+    assert "own 90 % interval, before widening" in str(table)
+    assert "before widening" in table.to_dict()["interval"]
 
 
 def test_progress_and_settings(log):
@@ -108,6 +120,10 @@ def test_a_right_clock_offset_helps():
         {"starts": 1.5},
         {"methods": ("x",)},
         {"level": 1.0},
+        {"level": "a"},
+        {"clock_offset": "a"},
+        {"lengths": "a"},
+        {"lengths": 5},
     ],
 )
 def test_wrong_arguments_are_named(log, wrong):

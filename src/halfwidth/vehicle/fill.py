@@ -2,8 +2,9 @@
 
 The log is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
 gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened by what
-hiding the log's own fixes shows (`calibrate`). A method that fails on a piece is replaced by a simpler one there, and
-the track says so.
+hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate too are tested by
+hiding these as well, and bridged by constant velocity where hidden fixes show that to be better. A method that fails on
+a piece is replaced by a simpler one there, and the track says so.
 
 Positions are those that the receiver would have reported. What it is wrong by for minutes at a time is in the fixes on
 both sides of a gap and in the filling between them, and hiding fixes cannot show it. The chain learns how large that
@@ -13,7 +14,7 @@ slow error is (its fix offset), and the half-widths have it added:
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import NormalDist
 from typing import Any
@@ -26,6 +27,7 @@ from halfwidth.vehicle import calibrate, chain
 from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, usable
 from halfwidth.vehicle.estimators import method as method_of
+from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path
@@ -48,8 +50,13 @@ FEWEST = 5
 #: Times that fixes are screened for strays at most.
 _SCREENINGS = 3
 
-#: Rounds in which the chain is solved again with hidden fixes, its scales kept.
-_AGAIN = 3
+#: Rounds in which the chain is solved again with hidden fixes, its scales kept: from the azimuths found with all fixes
+#: or, where a gap has no yaw rate or speed to find them by, from what is known without the hidden ones.
+_AGAIN, _AFRESH = 3, 10
+
+#: Constant velocity bridges a gap that lacks sensors if its error times its half-width is below this share of the
+#: chain's: the nearer path with the narrower interval that holds, as a single one of them may be luck.
+_BETTER = 0.8
 
 
 def fill(
@@ -92,8 +99,7 @@ def fill(
     BadValue
         If `level`, `method` or `clock_offset` is none.
     """
-    if not 0 < level < 1:
-        raise BadValue(f"`level` is {level!r}, a probability between 0 and 1 is expected", hint="0.9")
+    level, offset = level_of(level), clock_offset_of(clock_offset)
     asked = None if method is None else method_of(method)
     drive_log, native = as_log(log)
     if not drive_log.fixed.any():
@@ -104,7 +110,6 @@ def fill(
         messages.extend(doubtful.words(drive_log))
         drive_log = doubtful.masked(drive_log)
     drive_log = _with_pauses_filled(drive_log, messages)
-    offset = 0.0 if clock_offset is None else float(clock_offset)
     grid = sampled(drive_log, clock_offset=offset)
     chosen = _chosen(grid, asked, messages)
     if clock_offset is None and chosen.name not in ("linear", "cv"):
@@ -112,12 +117,13 @@ def fill(
     wanted, quality = _wanted(drive_log)
     t = drive_log.t[wanted]
     pieces = _pieces(grid, drive_log)
-    lengths = _spans(drive_log, t, quality)
-    answers = _estimated(pieces, chosen, lengths, level, messages)
+    spans = _spans(drive_log, grid, chosen, t, quality)
+    free = asked is None or asked.name != chosen.name
+    answers = _estimated(pieces, chosen, spans, level, messages, free=free)
     columns = _read(answers, pieces, t)
-    away, length = _distance_in_time(drive_log, t)
+    away = _distance_in_time(drive_log, t)
     z = NormalDist().inv_cdf(0.5 + level / 2)
-    half = _half_widths(columns, answers, grid, away, length, z, quality)
+    half = _half_widths(columns, answers, grid, away, z, t, quality)
     lat, lon = grid.frame.to_geodetic(columns.east, columns.north)
     gaps = gaps_of(t, lat, lon, half.max(axis=1), quality)
     settings: dict[str, object] = {"clock_offset": offset, "context": CONTEXT}
@@ -138,12 +144,38 @@ def fill(
         log=drive_log,
         gaps=gaps,
         # where nothing could be tested, a model's own variance is a size and no probability
-        guarantee="credible" if answers.tested or not lengths.size else "none",
+        guarantee="credible" if all(bridge.tested for bridge in answers.bridges) else "none",
         benchmark=tuple(asdict(one) for one in answers.tested) or None,
         settings=settings,
         messages=tuple(messages),
         native=native,
     )
+
+
+def level_of(given: Any) -> float:
+    """Return a level as a number between 0 and 1, or raise BadValue."""
+    level = _number(given)
+    if level is None or not 0 < level < 1:
+        raise BadValue(f"`level` is {given!r}, a probability between 0 and 1 is expected", hint="level=0.9")
+    return level
+
+
+def clock_offset_of(given: Any) -> float:
+    """Return a clock offset in seconds, 0 if it is None, or raise BadValue."""
+    offset = 0.0 if given is None else _number(given)
+    if offset is None or not np.isfinite(offset):
+        raise BadValue(f"`clock_offset` is {given!r}, a finite number of seconds is expected", hint="clock_offset=0.0")
+    return offset
+
+
+def _number(given: Any) -> float | None:
+    """Return a number as a float; None for text and whatever else is no number."""
+    if isinstance(given, str | bytes):
+        return None
+    try:
+        return float(given)
+    except (TypeError, ValueError):
+        return None
 
 
 def as_log(given: Any) -> tuple[Log, str]:
@@ -270,25 +302,45 @@ def _pieces(grid: Grid, log: Log) -> list[_Piece]:
     return pieces
 
 
-def _spans(log: Log, t: Floats, quality: NDArray[np.str_]) -> Floats:
-    """Return the lengths of the stretches to be filled, s."""
+@dataclass(frozen=True)
+class _Span:
+    """A stretch to be filled: between two fixes, or before the first or after the last one."""
+
+    start: float
+    stop: float
+    silent: tuple[str, ...]  # sensors that the log has, but not there
+
+    @property
+    def length(self) -> float:
+        return self.stop - self.start
+
+
+def _spans(log: Log, grid: Grid, chosen: Method, t: Floats, quality: NDArray[np.str_]) -> list[_Span]:
+    """Return the stretches to be filled, and which sensors are silent for most of each."""
     fixes = log.t[log.fixed]
-    lengths = [stop - start for start, stop in _gaps(log) if np.any((t > start) & (t < stop))]
+    ends = [(start, stop) for start, stop in _gaps(log) if np.any((t > start) & (t < stop))]
     if np.any(quality == "extrapolated"):
-        lengths += [s for s in (fixes[0] - log.t[0], log.t[-1] - fixes[-1]) if s > 0]
-    return np.array(lengths)
+        ends += [(a, b) for a, b in ((log.t[0], fixes[0]), (fixes[-1], log.t[-1])) if b > a]
+    spans = []
+    for start, stop in ends:
+        steps = (grid.t > start) & (grid.t <= stop)
+        took = grid.h[steps]
+        silent = tuple(
+            name
+            for name in chosen.needs + chosen.one_of
+            if getattr(grid, f"has_{name}") and took @ (getattr(grid, f"{name}_sd")[steps] > 0) > 0.5 * took.sum()
+        )
+        spans.append(_Span(float(start), float(stop), silent))
+    return spans
 
 
-def _distance_in_time(log: Log, t: Floats) -> tuple[Floats, Floats]:
-    """Return for each row the time to the nearest fix, and the length of the stretch without fixes it lies in, s."""
+def _distance_in_time(log: Log, t: Floats) -> Floats:
+    """Return for each row the time to the nearest fix, s."""
     fixes = log.t[log.fixed]
     k = np.searchsorted(fixes, t)
     after = np.where(k < fixes.size, fixes[np.minimum(k, fixes.size - 1)] - t, np.inf)
     before = np.where(k > 0, t - fixes[np.maximum(k - 1, 0)], np.inf)
-    on_fix = after == 0
-    away = np.where(on_fix, 0.0, np.minimum(before, after))
-    length = np.where(on_fix, 0.0, np.where(np.isfinite(before + after), before + after, 2 * away))
-    return away, length
+    return np.where(after == 0, 0.0, np.minimum(before, after))
 
 
 #: Names of what the chain finds, as the settings of a track have them.
@@ -297,8 +349,19 @@ _WORDS = {"speed_scale": "speed scale", "yaw_bias": "yaw bias", "slow_sd": "slow
 
 # ---- estimating ----------------------------------------------------------------------------------------------------
 
-#: Fills drives of which fixes were hidden; the numbers say which grid each comes from.
-Rerun = Callable[[Sequence[int], Sequence[Grid]], list[Path]]
+#: Fills drives of which fixes were hidden; the numbers say which grid each comes from, the last argument whether the
+#: azimuths that were found with all fixes may be used.
+Rerun = Callable[[Sequence[int], Sequence[Grid], bool], list[Path]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Bridge:
+    """How one stretch is filled, and what hiding fixes showed of it."""
+
+    span: _Span
+    by: str
+    tested: Sequence[calibrate.Tested]
+    least: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,13 +369,23 @@ class _Answers:
     """Paths of the pieces, what hiding fixes showed, and what was found on the way."""
 
     paths: list[Path]
-    tested: list[calibrate.Tested]
-    least: float
+    bridges: list[_Bridge]
     settings: dict[str, object]
+
+    @property
+    def tested(self) -> list[calibrate.Tested]:
+        """All tests that a half-width rests on."""
+        return list(dict.fromkeys(one for bridge in self.bridges for one in bridge.tested))
 
 
 def _estimated(
-    pieces: Sequence[_Piece], chosen: Method, lengths: Floats, level: float, messages: list[str]
+    pieces: Sequence[_Piece],
+    chosen: Method,
+    spans: Sequence[_Span],
+    level: float,
+    messages: list[str],
+    *,
+    free: bool,
 ) -> _Answers:
     """Estimate every piece, with simpler methods where the chosen one fails, and test the intervals."""
     grids = [piece.grid for piece in pieces]  # of which the chain takes away the fixes it cannot believe
@@ -323,21 +396,108 @@ def _estimated(
         messages.append(_failed_words(chosen, [pieces[i] for i in failed], len(pieces)))
     paths = [_spare(grid, chosen) if i in failed else found[i] for i, grid in enumerate(grids)]
     good = [i for i in range(len(grids)) if i not in failed]
-    tested: list[calibrate.Tested] = []
-    if lengths.size and good:
-        whole = [grids[i] for i in good]
-        tested = calibrate.tested(
-            whole,
-            lambda which, hidden: rerun([good[k] for k in which], hidden),
-            calibrate.lengths_to_test(whole, lengths),
-            level,
-            NormalDist().inv_cdf(0.5 + level / 2),
-        )
-        messages.extend(_test_words(tested, lengths, level))
-    settings.update({f"inflation at {one.length_s:.3g} s": round(one.inflation, 3) for one in tested})
+    sensed = all(grid.has_speed and grid.has_yaw_rate for grid in grids)
+    # where sensors are lacking the chain guesses what they would have said, and constant velocity may do better
+    simple = METHODS["cv"]
+    rivals: dict[int, Path] = {}
+    if free and chosen.name == "em" and good and any(span.silent or not sensed for span in spans):
+        rivals, rerun_simple, _ = _plain(simple, grids, good)
+        rivals = {i: path for i, path in rivals.items() if _plausible(path, grids[i])}
     # a variance that rests on a guess may be made smaller by the test, one that a model claims may not
     claimed = all(path.info.get("claimed", True) for path in paths) and all(grid.has_speed for grid in grids)
-    return _Answers(paths, tested, 1.0 if claimed else 0.0, settings)
+    bridges: list[_Bridge] = []
+    for silent in sorted({span.silent for span in spans}):
+        alike = [span for span in spans if span.silent == silent]
+        guessed = bool(silent) or not sensed
+        rival = guessed and len(rivals) == len(good) > 0
+
+        def filled(
+            which: Sequence[int], hidden: Sequence[Grid], guessed: bool = guessed, rival: bool = rival
+        ) -> dict[str, list[Path]]:
+            own = [good[k] for k in which]
+            first = rerun(own, hidden, guessed)
+            if not rival:
+                return {chosen.name: first}
+            second = rerun_simple(own, hidden, guessed)
+            both = zip(first, second, hidden, strict=True)
+            return {chosen.name: first, simple.name: [_bridged(a, b, grid, _pauses(grid)) for a, b, grid in both]}
+
+        tests: dict[str, list[calibrate.Tested]] = {}
+        if good:
+            whole = [grids[i] for i in good]
+            lengths = calibrate.lengths_to_test(whole, np.array([span.length for span in alike]))
+            z = NormalDist().inv_cdf(0.5 + level / 2)
+            tests = calibrate.tested(whole, filled, lengths, level, z, silent, guessed=guessed)
+        least = 1.0 if claimed and not silent else 0.0
+        # beyond the ends there is no gap with two sides to hide, so nothing shows that less would do
+        fixes = [grid.t[grid.seen] for grid in grids if grid.seen.any()]
+        first_fix, last_fix = min(t[0] for t in fixes), max(t[-1] for t in fixes)
+        mine = []
+        for span in alike:
+            inside = span.start >= first_fix - 1e-6 and span.stop <= last_fix + 1e-6
+            by = _nearer(tests, chosen.name, simple.name, span.length) if inside else chosen.name
+            mine.append(_Bridge(span, by, tuple(tests.get(by, ())), least if inside else max(least, 1.0)))
+        bridges += mine
+        messages.extend(_test_words(mine, level, chosen.name))
+    for i, path in rivals.items():
+        taken = [(b.span.start, b.span.stop) for b in bridges if b.by == simple.name != chosen.name]
+        paths[i] = _bridged(paths[i], path, grids[i], taken)
+    answers = _Answers(paths, bridges, settings)
+    settings.update(
+        {
+            f"inflation at {one.length_s:.3g} s{_without(one.silent)}{_by(one.by, chosen.name)}": round(
+                one.inflation, 3
+            )
+            for one in answers.tested
+        }
+    )
+    return answers
+
+
+def _nearer(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, simple: str, length: float) -> str:
+    """Return which of two ways came nearer to hidden fixes, and was surer, in stretches about as long as this."""
+    if usual not in tests or simple not in tests:
+        return simple if simple in tests else usual
+
+    def loss(name: str) -> float:
+        one = min(tests[name], key=lambda one: abs(np.log(one.length_s / max(length, 1e-3))))
+        return one.mean_m * one.half_m
+
+    return simple if loss(simple) < _BETTER * loss(usual) else usual
+
+
+def _pauses(grid: Grid) -> list[tuple[float, float]]:
+    """Return the stretches of a grid between fixes that are not neighbours."""
+    seen = np.flatnonzero(grid.seen)
+    apart = np.flatnonzero(np.diff(seen) > 1)
+    return [(float(grid.t[seen[k]]), float(grid.t[seen[k + 1]])) for k in apart]
+
+
+def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, float]]) -> Path:
+    """Take another path between the fixes on both sides of some stretches, shifted so that it meets this one there."""
+    seen = np.flatnonzero(grid.seen)
+    t = grid.t[seen]
+    columns: dict[str, Any] = {name: np.array(getattr(path, name)) for name in ("east", "north", "azimuth", "speed")}
+    if path.variance is None or other.variance is None:
+        return path
+    variance = path.variance.copy()
+    for start, stop in spans:
+        left = int(np.searchsorted(t, start + 1e-6, side="right")) - 1
+        right = int(np.searchsorted(t, stop - 1e-6))
+        if left < 0 or right >= seen.size or seen[right] - seen[left] < 2:
+            continue
+        a, b = seen[left], seen[right]
+        inside = slice(a + 1, b)
+        share = (grid.t[inside] - grid.t[a]) / (grid.t[b] - grid.t[a])
+        for name, own in columns.items():
+            new = getattr(other, name)
+            before, after = own[a] - new[a], own[b] - new[b]
+            if name == "azimuth":
+                before, after = float(wrapped(before)), float(wrapped(after))
+            own[inside] = new[inside] + (1 - share) * before + share * after
+        # a path says by itself how far fixes lie about it; what is kept is the sum
+        variance[inside] = np.maximum(other.variance[inside] + other.fix_variance - path.fix_variance, 0.0)
+    return replace(path, **columns, variance=variance)
 
 
 def _chain(
@@ -360,14 +520,14 @@ def _chain(
         some = "1 fix is" if len(times) == 1 else f"{len(times)} fixes are"
         messages.append(f"{some} far from where the vehicle can have been and left out: t = {words} s")
 
-    def rerun(which: Sequence[int], hidden: Sequence[Grid]) -> list[Path]:
+    def rerun(which: Sequence[int], hidden: Sequence[Grid], afresh: bool) -> list[Path]:
         return [
             fit.path
             for fit in chain.solve(
                 hidden,
-                chain.Chain(rounds=_AGAIN),
+                chain.Chain(rounds=_AFRESH if afresh else _AGAIN),
                 sigma=np.array([fits[i].sigma for i in which]),
-                azimuth=[fits[i].z[:, chain.AZIMUTH] for i in which],
+                azimuth=None if afresh else [fits[i].z[:, chain.AZIMUTH] for i in which],
                 learn=False,
             )
         ]
@@ -407,11 +567,11 @@ def _plain(
     """Run a method that learns from the longest piece."""
     tuned = chosen.tune(grids[max(able, key=lambda i: len(grids[i]))]) if able else {}
 
-    def rerun(which: Sequence[int], hidden: Sequence[Grid]) -> list[Path]:  # noqa: ARG001
+    def rerun(which: Sequence[int], hidden: Sequence[Grid], afresh: bool) -> list[Path]:  # noqa: ARG001
         return [_with_variance(p, g) for p, g in zip(chosen.run(hidden, tuned), hidden, strict=True)]
 
     settings: dict[str, object] = {f"{_words(name)} noise": float(f"{value:.3g}") for name, value in tuned.items()}
-    return dict(zip(able, rerun(able, [grids[i] for i in able]), strict=True)), rerun, settings
+    return dict(zip(able, rerun(able, [grids[i] for i in able], True), strict=True)), rerun, settings
 
 
 def _spare(grid: Grid, chosen: Method) -> Path:
@@ -490,22 +650,47 @@ def _failed_words(chosen: Method, pieces: Sequence[_Piece], n: int) -> str:
     )
 
 
-def _test_words(tested: Sequence[calibrate.Tested], lengths: Floats, level: float) -> list[str]:
-    """Say what hiding fixes showed."""
-    if not tested:
-        return ["too few fixes to test the half-widths on this log: they are the model's own"]
-    words = "; ".join(
-        f"{one.length_s:.3g} s: {100 * one.coverage:.0f} % of hidden fixes inside,"
-        f" widened {max(one.inflation, 1):.2f} times"
-        for one in tested
-    )
-    found = [f"{100 * level:g} % intervals tested on {sum(o.stretches for o in tested)} hidden stretches: {words}"]
-    longest = tested[-1].length_s
-    if lengths.max() > 1.2 * longest:
-        found.append(
-            f"the longest gap lasts {lengths.max():.0f} s but this log can test intervals only up to {longest:.0f} s"
+def _test_words(bridges: Sequence[_Bridge], level: float, usual: str) -> list[str]:
+    """Say what hiding fixes showed about gaps of one kind."""
+    found = []
+    without = _without(bridges[0].span.silent)
+    for by in dict.fromkeys(bridge.by for bridge in bridges):
+        mine = [bridge for bridge in bridges if bridge.by == by]
+        tested, least = mine[0].tested, min(bridge.least for bridge in mine)
+        if not tested:
+            found.append(
+                f"too few fixes to test the half-widths{without} on this log: they are the model's own,"
+                f" widened {calibrate.UNTESTED:g} times"
+            )
+            continue
+        words = "; ".join(
+            f"{one.length_s:.3g} s: {100 * one.coverage:.0f} % of hidden fixes inside, {_change(one.inflation, least)}"
+            for one in tested
         )
+        found.append(
+            f"{100 * level:g} % intervals{without}{_by(by, usual)} tested on {sum(o.stretches for o in tested)} hidden"
+            f" stretches: {words}"
+        )
+        longest, most = tested[-1].length_s, max(bridge.span.length for bridge in mine)
+        if most > 1.2 * longest:
+            found.append(
+                f"the longest gap{without} lasts {most:.0f} s but this log can test intervals only up to"
+                f" {longest:.0f} s"
+            )
     return found
+
+
+def _change(inflation: float, least: float) -> str:
+    factor = max(inflation, least, calibrate.LEAST)
+    return f"widened {factor:.2f} times" if factor >= 1 else f"narrowed to {factor:.2f} times"
+
+
+def _without(silent: Sequence[str]) -> str:
+    return f" without {' and '.join(_words(name) for name in silent)}" if silent else ""
+
+
+def _by(name: str, usual: str) -> str:
+    return f" bridged by {name}" if name != usual else ""
 
 
 # ---- reading the track off the paths -------------------------------------------------------------------------------
@@ -568,12 +753,19 @@ def _curve(t: Floats, p: Floats, at: Floats) -> Floats:
 
 
 def _half_widths(
-    columns: _Columns, answers: _Answers, grid: Grid, away: Floats, length: Floats, z: float, quality: NDArray[np.str_]
+    columns: _Columns,
+    answers: _Answers,
+    grid: Grid,
+    away: Floats,
+    z: float,
+    t: Floats,
+    quality: NDArray[np.str_],
 ) -> Floats:
     """Return the half-widths (M, 2), m: the model's, widened as tested, and no wider than a vehicle can go."""
     factor = np.ones(away.size)
-    empty = quality != "fix"
-    factor[empty] = calibrate.inflation(answers.tested, length[empty], least=answers.least)
+    for bridge in answers.bridges:
+        rows = (quality != "fix") & (t >= bridge.span.start) & (t <= bridge.span.stop)
+        factor[rows] = calibrate.inflation(bridge.tested, np.array([bridge.span.length]), least=bridge.least)
     quick = factor[:, None] ** 2 * (columns.variance + columns.fix_variance[:, None])
     half = z * np.sqrt(quick + columns.slow_variance[:, None])
     # twice: both the estimate and the vehicle are within reach of the nearest fix

@@ -8,7 +8,9 @@ that may be.
 """
 
 from bisect import bisect_left
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,9 +89,19 @@ class Grid:
         """Return the grid with fixes and courses of ``t0 <= t <= t1`` hidden."""
         return self.masked((self.t >= t0) & (self.t <= t1))
 
-    def masked(self, hidden: Mask) -> "Grid":
-        """Return the grid with the fixes and courses of some nodes, (T,), hidden."""
-        return replace(self, seen=self.seen & ~hidden, course=np.where(hidden, np.nan, self.course))
+    def masked(self, hidden: Mask, silent: Iterable[str] = ()) -> "Grid":
+        """Return the grid with the fixes and courses of some nodes, (T,), hidden.
+
+        The sensors named in `silent`, ``"speed"`` or ``"yaw_rate"``, are taken away there as well: their means are
+        interpolated from node to node around it, as `sampled` does where a log lacks them.
+        """
+        grid = replace(self, seen=self.seen & ~hidden, course=np.where(hidden, np.nan, self.course))
+        for name in silent:
+            if getattr(self, f"has_{name}"):
+                mean, sd = _silenced(self.t, hidden, getattr(self, name), getattr(self, f"{name}_sd"), *_DRIFT[name])
+                changed: dict[str, Any] = {name: mean, f"{name}_sd": sd}
+                grid = replace(grid, **changed)
+        return grid
 
 
 _ARRAYS = ("t", "east", "north", "seen", "course", "speed", "yaw_rate", "speed_sd", "yaw_rate_sd")
@@ -213,6 +225,24 @@ def _silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
     h = np.concatenate((np.diff(t)[:1], np.diff(t)))
     sd = np.minimum(rate * far, most) * np.sqrt(np.maximum(length / h, 1.0))
     return np.where(length > limit, sd, 0.0)
+
+
+def _silenced(t: Floats, hidden: Mask, mean: Floats, sd: Floats, rate: float, most: float) -> tuple[Floats, Floats]:
+    """Return means and deviations of a sensor that says nothing from node to node around each hidden stretch."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], hidden, [False]))))
+    h = np.concatenate((np.diff(t)[:1], np.diff(t)))
+    middle = t - h / 2
+    lost, new = np.zeros(t.size, dtype=bool), sd.copy()
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        start, stop = t[max(a - 1, 0)], t[min(b, t.size - 1)]
+        steps = slice(a, b + 1)  # the one that ends in the first node after it as well
+        far = np.minimum(middle[steps] - start, stop - middle[steps])
+        share = np.sqrt(np.maximum((stop - start) / h[steps], 1.0))
+        lost[steps] = True
+        new[steps] = np.maximum(sd[steps], np.minimum(rate * np.maximum(far, 0.0), most) * share)
+    if lost.all():
+        return mean, new
+    return np.where(lost, np.interp(middle, middle[~lost], mean[~lost]), mean), new
 
 
 def _course(log: Log, t: Floats, seen: Mask) -> Floats:

@@ -4,7 +4,8 @@ Starts are drawn at random and are the same for every method. Only the fixes (an
 speed and yaw rate stay. A start counts only if the vehicle averages more than 1 m/s in the outage, since standing still
 is no test. The error is the distance to each hidden fix. A cell of the table is the mean over all hidden fixes and the
 mean over starts of the largest error of each outage. `coverage` is the share of hidden fixes, east and north counted
-apart, inside the interval at `level` of a method that claims one.
+apart, inside the interval at `level` of a method that claims one: its own interval, before `fill` widens it by what
+hiding fixes shows.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -52,7 +53,8 @@ class Cell:
     n_fixes : (n,) int array
         Hidden fixes of each outage.
     inside : (n,) array or None
-        Share of them inside the interval, each axis by itself; None where the method claims no interval.
+        Share of them inside the method's own interval, before `fill` would widen it, each axis by itself; None where
+        the method claims no interval.
     failed : int
         Outages in which the method found no usable path; there the straight line was counted instead.
     seconds : float
@@ -101,7 +103,7 @@ class Cell:
 
     @property
     def coverage(self) -> float | None:
-        """Share of hidden fixes inside the interval; None where the method claims no interval."""
+        """Share of hidden fixes inside the method's own interval, before widening; None where it claims none."""
         return None if self.inside is None else float(np.average(self.inside, weights=self.n_fixes))
 
 
@@ -191,8 +193,6 @@ class Outages:
 
     def table(self) -> str:
         """Return the table as text: mean / mean of maxima in metres, then coverage."""
-        if not self.cells:
-            return "\n".join(["no outage could be tried", *self._notes()])
         lengths, name = self.lengths, max(len(m) for m in (*self.methods, "coverage"))
         head = f"{'':{name}}" + "".join(f"{f'{length:g} s':>16}" for length in lengths)
         starts = [max(c.n for c in self.cells if c.length == length) for length in lengths]
@@ -206,7 +206,11 @@ class Outages:
             lines.append(f"{m:{name}}" + "".join(f"{_pair(c):>16}" for c in row))
         covered = [c for c in self.cells if c.coverage is not None]
         if covered:
-            lines += ["", f"share of hidden fixes inside the {100 * self.level:g} % interval", head]
+            lines += [
+                "",
+                f"share of hidden fixes inside the methods' own {100 * self.level:g} % interval, before widening",
+                head,
+            ]
             for m in dict.fromkeys(c.method for c in covered):
                 row = [self._found(m, length) for length in lengths]
                 shares = ["" if c is None or c.coverage is None else f"{c.coverage:.2f}" for c in row]
@@ -231,9 +235,14 @@ class Outages:
         return ["", *notes] if notes else []
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything but the single errors as plain data, for JSON."""
+        """Return everything but the single errors as plain data, for JSON.
+
+        `coverage` of a cell is that of the method's own interval, as `interval` says: `fill` widens it before it
+        claims anything.
+        """
         return {
             "level": self.level,
+            "interval": "of the method itself, before widening",
             "seed": self.seed,
             "clock_offset": self.clock_offset,
             "skipped": dict(self.skipped),
@@ -290,22 +299,25 @@ def outages(
     Raises
     ------
     BadValue
-        If a length is not positive, `starts` is not a positive whole number, or a method has no such name.
+        If a length is not positive, `starts` is not a positive whole number, `level` or `clock_offset` is none, a
+        method has no such name, or every length is longer than the log allows.
     BadLog
-        If the log has fewer than three fixes.
+        If the log has fewer than three fixes, the vehicle does not move, or no method of those asked for can use its
+        sensors: if nothing at all could be tried.
     """
-    from halfwidth.vehicle.fill import as_log
+    from halfwidth.vehicle.fill import as_log, clock_offset_of, level_of
 
-    given = tuple(float(length) for length in lengths)
+    try:
+        given = tuple(float(length) for length in lengths)
+    except (TypeError, ValueError):
+        given = ()
     if not given or not all(np.isfinite(length) and length > 0 for length in given):
         raise BadValue(f"`lengths` is {lengths!r}, positive numbers of seconds are expected", hint="lengths=(1, 5, 30)")
     if not isinstance(starts, int) or starts < 1:
         raise BadValue(f"`starts` is {starts!r}, a whole number from 1 is expected", hint="starts=20")
-    if not 0 < level < 1:
-        raise BadValue(f"`level` is {level!r}, a probability between 0 and 1 is expected", hint="0.9")
+    level, offset = level_of(level), clock_offset_of(clock_offset)
     drive_log: Log = as_log(log)[0]
     chosen = [method(name) for name in (METHODS if methods is None else methods)]
-    offset = 0.0 if clock_offset is None else float(clock_offset)
     drive = sampled(drive_log, clock_offset=offset)
     if int(drive.seen.sum()) < 3:
         raise BadLog(f"the log has {int(drive.seen.sum())} fixes, at least 3 are expected to hide some")
@@ -318,6 +330,10 @@ def outages(
         elif places[length].size < starts:
             skipped[f"{length:g} s"] = f"only {places[length].size} of {starts} starts found a place"
     tried = [length for length in given if places[length].size]
+    if not usable_methods:
+        raise BadLog("; ".join(f"`{m.name}`: {skipped[m.name]}" for m in chosen), hint="methods=('linear', 'cv')")
+    if not tried:
+        raise _nothing_to_try(drive, given)
     total = len(usable_methods) * len(tried)
     cells: list[Cell] = []
     for m in usable_methods:
@@ -347,6 +363,26 @@ def _starts(drive: Grid, length: float, n: int, seed: int) -> Floats:
     after = np.searchsorted(t, end + MARGIN, side="right") - np.searchsorted(t, end, side="right")
     good = (pace > MIN_SPEED) & (hidden > 0) & (before > 1) & (after > 1)
     return begin[good][:n]
+
+
+def _nothing_to_try(drive: Grid, lengths: Sequence[float]) -> BadLog | BadValue:
+    """Say why no outage of these lengths has a place in the log, and which lengths have."""
+    fixes = drive.t[drive.seen]
+    span = float(fixes[-1] - fixes[0])
+    asked = ", ".join(f"{length:g}" for length in lengths)
+    possible = [length for length in LENGTHS if _starts(drive, length, 1, 1).size]
+    if not possible:
+        return BadLog(
+            f"the log has no place for an outage: its fixes span {span:.0f} s, and fixes within {MARGIN:g} s on both"
+            f" sides of an outage and a vehicle faster than {MIN_SPEED:g} m/s in it are expected",
+            hint="halfwidth check LOG",
+        )
+    words = ", ".join(f"{length:g}" for length in possible)
+    return BadValue(
+        f"`lengths` is {asked} s but the fixes of the log span {span:.0f} s, and {MARGIN:g} s of fixes on both sides of"
+        f" an outage in which the vehicle moves are expected: {words} s can be tried",
+        hint=f"lengths=({', '.join(f'{length:g}' for length in possible[-3:])},)",
+    )
 
 
 def _pace(drive: Grid) -> Floats:
