@@ -1,5 +1,6 @@
 """The exported names, and nothing else."""
 
+import pathlib
 import subprocess
 import sys
 
@@ -38,3 +39,10 @@ def test_functions_keep_their_names_whatever_was_imported_first():
     code = "import halfwidth.estimate, halfwidth.learn, halfwidth.score, halfwidth as hw; print(callable(hw.estimate), callable(hw.learn))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.split() == ["True", "True"]
+
+
+def test_type_checkers_see_every_public_name():
+    for package in (hw, hw.vehicle):
+        source = pathlib.Path(package.__file__).read_text()
+        for name in package.__all__:
+            assert name == "__version__" or f"import {name} as {name}\n" in source, name

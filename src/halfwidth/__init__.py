@@ -7,11 +7,9 @@ the user. NaN in y is a missing entry.
 `estimate(model, record, method)` is the one front door; every answer is an `Estimate` with a `Status`.
 """
 
-import importlib
-import sys
-import types
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from halfwidth.lazy import lazy
 from halfwidth.methods import ESTIMATORS
 
 __version__ = "0.1.0"
@@ -57,9 +55,6 @@ _HOME: dict[str, str] = {
     "Recursive": "methods._protocol",
 } | {name: f"methods.{module}" for name, module in ESTIMATORS.items()}
 
-#: Packages that are part of the public names, loaded when first used as well.
-_PACKAGES = ("vehicle",)
-
 __all__ = ["__version__", *sorted(_HOME)]
 
 if TYPE_CHECKING:
@@ -82,6 +77,8 @@ if TYPE_CHECKING:
     from halfwidth.loss import Markov as Markov
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.methods.kalman import KalmanFilter as KalmanFilter
+    from halfwidth.methods.kalman import KalmanSmoother as KalmanSmoother
     from halfwidth.methods.loss import BKF1 as BKF1
     from halfwidth.methods.loss import BKF2 as BKF2
     from halfwidth.methods.loss import GPB as GPB
@@ -89,10 +86,13 @@ if TYPE_CHECKING:
     from halfwidth.methods.loss import BeamSearch as BeamSearch
     from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
     from halfwidth.methods.loss import Runnalls as Runnalls
+    from halfwidth.methods.map import BatchLP as BatchLP
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
+    from halfwidth.methods.sequential import SequentialLP as SequentialLP
     from halfwidth.methods.window import MemoryChoice as MemoryChoice
+    from halfwidth.methods.window import Window as Window
     from halfwidth.methods.window import choose_memory as choose_memory
     from halfwidth.methods.window import ensemble_interval as ensemble_interval
     from halfwidth.model import Linear as Linear
@@ -111,28 +111,4 @@ if TYPE_CHECKING:
     from halfwidth.stream import resume as resume
     from halfwidth.stream import stream as stream
 
-
-def __getattr__(name: str) -> Any:
-    if name in _PACKAGES:
-        return importlib.import_module(f"halfwidth.{name}")
-    if name not in _HOME:
-        raise AttributeError(f"module 'halfwidth' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"halfwidth.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return list(__all__)
-
-
-class _Package(types.ModuleType):
-    """The package: a public function keeps its name although the module that holds it is called the same."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # The import system binds every submodule it loads to the package; `halfwidth.learn` must stay the function.
-        if not (name in _HOME and isinstance(value, types.ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+lazy(__name__, _HOME | {"vehicle": "vehicle"})

@@ -4,10 +4,9 @@ Conventions: times in seconds, angles in radians clockwise from north, yaw rate 
 longitude in degrees of WGS-84, local positions in metres east and north.
 """
 
-import importlib
-import sys
-import types
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from halfwidth.lazy import lazy
 
 #: Public names and the module of each, loaded when first used.
 _HOME: dict[str, str] = {
@@ -57,26 +56,4 @@ if TYPE_CHECKING:
     from halfwidth.vehicle.track import Gap as Gap
     from halfwidth.vehicle.track import Track as Track
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'halfwidth.vehicle' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"halfwidth.vehicle.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return list(__all__)
-
-
-class _Package(types.ModuleType):
-    """The package: a public function keeps its name although the module that holds it is called the same."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # The import system binds every submodule it loads to the package; `vehicle.fill` must stay the function.
-        if not (name in _HOME and isinstance(value, types.ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+lazy(__name__, _HOME)
