@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 
 from halfwidth import methods
 from halfwidth.array import Array
-from halfwidth.errors import BadRecord, BadValue, Refused, hinted
+from halfwidth.errors import BadValue, Refused, hinted
 from halfwidth.estimate import choose
-from halfwidth.methods._protocol import typed
+from halfwidth.methods._protocol import pushed_row, typed
 from halfwidth.model import Linear, Model
 from halfwidth.noise import Gaussian
 from halfwidth.result import Estimate, Newest
@@ -199,15 +199,7 @@ class _Stepped:
 
     def push(self, y: ArrayLike | None, u: ArrayLike | None = None, dt: float | None = None) -> Estimate:
         model = self.model
-        step = model.dt if dt is None else float(dt)
-        if not step > 0 or not math.isfinite(step):
-            raise BadRecord(f"`dt` is {dt!r}, a positive number of seconds was expected")
-        row = np.full(model.ny, np.nan) if y is None else np.atleast_1d(np.array(y, dtype=float))
-        if row.shape != (model.ny,) or np.isinf(row).any():
-            raise BadRecord(f"`y` is {y!r}, {model.ny} numbers were expected; None or NaN is missing")
-        inputs = None if u is None else np.atleast_1d(np.array(u, dtype=float))
-        if (0 if inputs is None else inputs.size) != model.nu or (inputs is not None and not np.isfinite(inputs).all()):
-            raise BadRecord(f"`u` is {u!r}, {model.nu} finite numbers were expected")
+        row, inputs, step = pushed_row(model, y, u, dt)
         self.state = self.method.step(model, self.state, row, inputs, self.t + step, step)
         self.t += step
         self.pushed += 1

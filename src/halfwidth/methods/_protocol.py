@@ -4,12 +4,15 @@ An estimator is a frozen value of settings with ``refuses(model)`` and one pure 
 gives ``init`` and ``step`` instead; `scan` is its offline form and `halfwidth.stream` its online form.
 """
 
+import math
 from dataclasses import fields
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from halfwidth.array import Array
+from halfwidth.errors import BadRecord
 from halfwidth.model import Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
@@ -68,6 +71,22 @@ def scan(method: Any, model: Model, record: Record) -> Estimate:
         names=model.names.x,
         labels=record.labels,
     )
+
+
+def pushed_row(
+    model: Model, y: ArrayLike | None, u: ArrayLike | None, dt: float | None
+) -> tuple[Array, Array | None, float]:
+    """Judge one row of a stream: outputs (ny,), NaN where missing; inputs (nu,) or None; the step before it, s."""
+    step = model.dt if dt is None else float(dt)
+    if not step > 0 or not math.isfinite(step):
+        raise BadRecord(f"`dt` is {dt!r}, a positive number of seconds was expected")
+    row = np.full(model.ny, np.nan) if y is None else np.atleast_1d(np.array(y, dtype=float))
+    if row.shape != (model.ny,) or np.isinf(row).any():
+        raise BadRecord(f"`y` is {y!r}, {model.ny} numbers were expected; None or NaN is missing")
+    inputs = None if u is None else np.atleast_1d(np.array(u, dtype=float))
+    if (0 if inputs is None else inputs.size) != model.nu or (inputs is not None and not np.isfinite(inputs).all()):
+        raise BadRecord(f"`u` is {u!r}, {model.nu} finite numbers were expected")
+    return row, inputs, step
 
 
 def typed(method: Any) -> str:

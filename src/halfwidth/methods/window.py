@@ -31,8 +31,8 @@ from numpy.typing import ArrayLike, NDArray
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.errors import BadRecord, BadValue, Refused
-from halfwidth.methods._protocol import Estimator, typed
+from halfwidth.errors import BadValue, Refused
+from halfwidth.methods._protocol import Estimator, pushed_row, typed
 from halfwidth.methods._residuals import reference, residuals
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.sequential import (
@@ -630,15 +630,7 @@ class _Live:
     def push(self, y: ArrayLike | None, u: ArrayLike | None = None, dt: float | None = None) -> Estimate:
         """Fold one row in and return the newest estimate."""
         model = self.model
-        step = model.dt if dt is None else float(dt)
-        if not step > 0 or not math.isfinite(step):
-            raise BadRecord(f"`dt` is {dt!r}, a positive number of seconds was expected")
-        row = np.full(model.ny, np.nan) if y is None else np.atleast_1d(np.array(y, dtype=float))
-        if row.shape != (model.ny,) or np.isinf(row).any():
-            raise BadRecord(f"`y` is {y!r}, {model.ny} numbers were expected; None or NaN is missing")
-        inputs = None if u is None else np.atleast_1d(np.array(u, dtype=float))
-        if (0 if inputs is None else inputs.size) != model.nu or (inputs is not None and not np.isfinite(inputs).all()):
-            raise BadRecord(f"`u` is {u!r}, {model.nu} finite numbers were expected")
+        row, inputs, step = pushed_row(model, y, u, dt)
         self.t += step
         self.times.append(self.t)
         self.y.append(row)
