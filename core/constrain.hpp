@@ -24,6 +24,7 @@ namespace {
 constexpr double constrain_far = 30.0;       // sd between the belief and a constraint from which on they contradict
 constexpr double constrain_slack = 1e-11;    // of numbers that differ by rounding only, relative
 constexpr double constrain_flat = 1e-13;     // a row's variance below this share of what it could be is none
+constexpr double constrain_rounding = 1e-14;  // a pivot below this share of the variance before is none
 constexpr double constrain_pinned = 1e-8;    // a cavity below this share of its belief cannot be found by subtraction
 constexpr double constrain_idle = 8.5;          // sd beyond which a bound cuts off less than rounding
 constexpr double constrain_settled = 1e-5;      // of mean and variance, relative to the belief
@@ -319,6 +320,32 @@ inline int constrain_cuts(Constraints& c, int by, double* P) {
     return 1;
 }
 
+// Where cuts took nearly all variance of a direction, what is left is rounding and may be negative: S <- L L' without the
+// pivots that are nothing beside P, the covariance before.
+inline void constrain_repair(int n, const double* P, double* S, double* L) {
+    bool noise = false;
+    for (int j = 0; j < n; j++) {
+        double p = S[j * n + j];
+        for (int k = 0; k < j; k++) p -= L[j * n + k] * L[j * n + k];
+        const bool real = p > constrain_rounding * P[j * n + j];
+        noise = noise || !real;
+        const double root = real ? std::sqrt(p) : 0.0;
+        L[j * n + j] = root;
+        for (int i = j + 1; i < n; i++) {
+            double s = S[i * n + j];
+            for (int k = 0; k < j; k++) s -= L[i * n + k] * L[j * n + k];
+            L[i * n + j] = real ? s / root : 0.0;
+        }
+    }
+    if (!noise) return;
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j <= i; j++) {
+            double s = 0.0;
+            for (int k = 0; k <= j; k++) s += L[i * n + k] * L[j * n + k];
+            S[i * n + j] = S[j * n + i] = s;
+        }
+}
+
 // One belief N(x, P), in place. `distance`: the standard deviations from x to the farthest constraint that it breaks.
 // Returns 0; 1 if the iteration stopped before it settled; 2 if a constraint lies more than `constrain_far` standard
 // deviations away; 4 if nothing fulfils row `row` of D, and then x and P stay. Codes 2 and 4 name the row.
@@ -392,6 +419,7 @@ inline int constrain_row(Constraints& c, int by, double* x, double* P, double* d
     } else {
         copy(Dim<0>(n), kept, c.away);
     }
+    if (c.n_equal || by == constrain_by_ep || by == constrain_by_truncation) constrain_repair(n, kept + n, P, c.M);
     for (int i = 0; i < n; i++) x[i] += c.away[i];
     constrain_clip(c, x);
     return *distance > constrain_far ? 2 : code;

@@ -125,13 +125,18 @@ class Constrained:
         Raises
         ------
         Refused
-            If the method inside does not go forward row by row.
+            If the method inside does not go forward row by row, or its state cannot be changed.
         """
         if not hasattr(self.method, "step") or getattr(self.method, "smooth", False):
             raise Refused(
                 f"`{typed(self.method)}` inside `Constrained` has no online form", hint="Constrained(KalmanFilter())"
             )
         inner = self.method.init(replace(model, bounds=None))  # type: ignore[attr-defined]
+        if self.feedback and not {"x", "P"} <= set(getattr(inner, "_fields", ())):
+            raise Refused(
+                f"the state of `{typed(self.method)}` is no named tuple with x and P, so nothing can be fed back into it",
+                hint="Constrained(..., feedback=False)",
+            )
         x, P, _ = self.method.belief(model, inner)  # type: ignore[attr-defined]
         return Held(inner, 0, x, P, 0, -1, 0.0)
 
