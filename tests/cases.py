@@ -88,7 +88,8 @@ def _cases():
     model = dataclasses.replace(unknown, w=hw.Uniform.unknown(at_most=5.0), e=hw.Uniform.unknown(at_most=5.0))
     found.append(Case("oscillator unknown", model, truth, holes(record, 6, 0.2)))
     bounded = dataclasses.replace(
-        oscillator(hw.Gaussian([0.1, 0.2, 0.1]), hw.Gaussian([0.3, 0.4]), ball), bounds=hw.Box([-2.7, -2.7, -2.1], [0.6, 3.2, np.inf])
+        oscillator(hw.Gaussian([0.1, 0.2, 0.1]), hw.Gaussian([0.3, 0.4]), ball),
+        bounds=hw.Box([-2.7, -2.7, -2.1], [0.6, 3.2, np.inf]),
     )
     add("oscillator in a box", bounded, u=u, outage=(20, 30))
     # x0 + x2 between two numbers, x1 from below, and an equality

@@ -203,7 +203,7 @@ class Newest(Estimate):
 
     @property
     def status(self) -> Status:
-        """Whether the push went well: 2 contradicts a certainty, 3 left the range of floating point, 4 fits no bounds."""
+        """Whether the push went well: code 2 contradicts a certainty, 3 left the range of floats, 4 fits no bounds."""
         code = self._belief.code
         return Status.OK if code < 2 else {2: Status.REDUCED, 4: Status.INFEASIBLE}.get(code, Status.COLLAPSED)
 

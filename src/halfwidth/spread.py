@@ -1,4 +1,4 @@
-"""What is known of a state: a box, half-spaces, a Gaussian, or a cloud of points. Priors of x0, bounds, spreads of answers.
+"""What is known of a state: a box, half-spaces, a Gaussian or a cloud. Priors of x0, bounds, spreads of answers.
 
 Each has ``interval(level) -> (lo, hi)`` and the flag ``guaranteed``, so that scores, plots and reports never ask which
 estimator ran.
@@ -191,7 +191,9 @@ class Normal:
     mean: Array
     P: Array
     guaranteed = False
-    _within: ClassVar[tuple[Array, Array] | None] = None  # (lo, hi) that every state is known to lie in: intervals end there
+    _within: ClassVar[tuple[Array, Array] | None] = (
+        None  # (lo, hi) that every state is known to lie in: intervals end there
+    )
 
     def __init__(self, mean: ArrayLike, P: ArrayLike) -> None:
         m = np.atleast_1d(real(mean, "mean"))

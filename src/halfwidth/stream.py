@@ -210,9 +210,7 @@ class _Stepped:
         verdict = getattr(self.method, "verdict", None)
         code, message, within = (0, None, None) if verdict is None else verdict(model, self.state)
         code = code if np.isfinite(x).all() else 3
-        object.__setattr__(
-            newest, "_belief", _Belief(self.t, x, P, float(loglik), code, self.pushed, message, within)
-        )
+        object.__setattr__(newest, "_belief", _Belief(self.t, x, P, float(loglik), code, self.pushed, message, within))
         return newest
 
     def snapshot(self) -> bytes:

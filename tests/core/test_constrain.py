@@ -2,11 +2,10 @@
 
 import math
 
+import halfwidth._core as _core
 import numpy as np
 import pytest
 from tests import naive_constrain as naive
-
-import halfwidth._core as _core
 
 EP, TRUNCATE, PROJECT, NEAREST = range(4)
 inf = math.inf
@@ -50,7 +49,9 @@ def test_one_cut_is_that_of_the_paper(n):
 
 @pytest.mark.parametrize("by", [EP, TRUNCATE])
 def test_a_single_cut_is_exact_far_into_the_tails(by):
-    cases = [(a, b) for a in (-40.0, -6.0, -1.0, 0.0, 2.0, 8.0, 20.0, 29.9, 35.0) for b in (a + 1e-3, a + 0.5, a + 7, inf)]
+    cases = [
+        (a, b) for a in (-40.0, -6.0, -1.0, 0.0, 2.0, 8.0, 20.0, 29.9, 35.0) for b in (a + 1e-3, a + 0.5, a + 7, inf)
+    ]
     for lo, hi in [*cases, *[(-b, -a) for a, b in cases]]:
         for c in (1.0, 1e-12, 1e12):
             s = math.sqrt(c)
@@ -121,8 +122,8 @@ def test_projection_agrees_with_a_solver_on_larger_sets():
             solver.setup(W, -W @ x, None, None, D, np.maximum(lo, -big), np.minimum(hi, big))
             solver.solve()
             z = solver.result.x
-            assert np.all(D @ X >= lo - 1e-9)
-            assert np.all(D @ X <= hi + 1e-9)
+            assert np.all(lo - 1e-9 <= D @ X)
+            assert np.all(hi + 1e-9 >= D @ X)
             assert (X - x) @ W @ (X - x) <= (z - x) @ W @ (z - x) * (1 + 1e-6)
             np.testing.assert_allclose(X, z, atol=1e-4)
 
@@ -209,9 +210,7 @@ def test_saying_the_same_twice_changes_nothing(by):
         x, P, D, lo, hi = drawn(rng, 3, 2, sides=False)
         once = run(by, x, P, D, lo, hi)
         turned = np.vstack([D, D[:1], -3 * D[1:], np.zeros((1, 3)), D[:1]])
-        again = run(
-            by, x, P, turned, np.r_[lo, lo[0], -3 * hi[1], 0, -inf], np.r_[hi, hi[0] + 5, -3 * lo[1], 0, inf]
-        )
+        again = run(by, x, P, turned, np.r_[lo, lo[0], -3 * hi[1], 0, -inf], np.r_[hi, hi[0] + 5, -3 * lo[1], 0, inf])
         np.testing.assert_allclose(again[0], once[0], rtol=1e-12, atol=1e-13)
         np.testing.assert_allclose(again[1], once[1], rtol=1e-12, atol=1e-13)
     twice = run(by, x, P, np.vstack([D[:1], D[:1]]), [0.1, 0.1], [0.1, 0.1 + 1e-17])
@@ -268,8 +267,8 @@ def test_answers_are_feasible_symmetric_and_not_wider(by):
         if code == 4:
             continue
         slack = 1e-9 * (1 + np.abs(X).max())
-        assert np.all(D @ X >= lo - slack)
-        assert np.all(D @ X <= hi + slack)
+        assert np.all(lo - slack <= D @ X)
+        assert np.all(hi + slack >= D @ X)
         if by != NEAREST:
             assert np.linalg.eigvalsh(P - S)[0] >= -1e-9 * np.abs(P).max()
 

@@ -52,7 +52,9 @@ def test_every_answer_obeys(by, feedback, bounds):
             np.testing.assert_array_equal(est.info["distance"] > 0, outside)
 
 
-@pytest.mark.parametrize("method", [hw.KalmanFilter(), hw.KalmanSmoother(), hw.KalmanSmoother(lag=3), hw.UnscentedKalman()])
+@pytest.mark.parametrize(
+    "method", [hw.KalmanFilter(), hw.KalmanSmoother(), hw.KalmanSmoother(lag=3), hw.UnscentedKalman()]
+)
 def test_by_default_the_recursion_knows_no_bounds(method):
     model, record = walk(hw.Box(0, 1)), seen()
     plain = hw.estimate(dataclasses.replace(model, bounds=None), record, method)
@@ -135,7 +137,13 @@ def test_bounds_that_nothing_fulfils_are_infeasible_and_name_the_row():
 
 def test_a_state_known_for_certain_outside_is_infeasible():
     model = hw.Linear(
-        np.eye(2), None, [[1, 0]], hw.Gaussian([1.0, 0.0]), hw.Gaussian(1.0), hw.Normal([0, 5], [1.0, 0.0]), bounds=(0, 1)
+        np.eye(2),
+        None,
+        [[1, 0]],
+        hw.Gaussian([1.0, 0.0]),
+        hw.Gaussian(1.0),
+        hw.Normal([0, 5], [1.0, 0.0]),
+        bounds=(0, 1),
     )
     est = hw.estimate(model, hw.Record([1.0], [0.5]), hw.Constrained())
     assert est.status is hw.Status.INFEASIBLE

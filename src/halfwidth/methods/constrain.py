@@ -5,9 +5,9 @@ the other: with ``s^2 = f' P f`` and mean mu and variance v of a standard normal
 
     x <- x + P f mu / s,    P <- P - (1 - v) P f f' P / s^2
 
-which is Simon and Simon's form without its decompositions. Expectation propagation repeats it with each constraint's own
-share taken out first, until all agree; then the order does not matter. Projection takes the nearest feasible point and
-leaves P as it is, but for equalities.
+which is Simon and Simon's form without its decompositions. Expectation propagation repeats it with each constraint's
+own share taken out first, until all agree; then the order does not matter. Projection takes the nearest feasible point
+and leaves P as it is, but for equalities.
 
 By default the recursion itself stays unconstrained: a bound that always holds says the same at each row, and a filter
 that is told the same again and again believes it too much.
@@ -53,8 +53,8 @@ class Constrained:
     by : {"ep", "truncate", "project", "nearest"}
         ``"ep"`` and ``"truncate"`` give mean and covariance of the belief cut at the bounds: by expectation propagation
         over all constraints, or by one cut each, most broken first, which is faster and coarser where constraints
-        meet. ``"project"`` takes the most probable feasible state, ``"nearest"`` the one nearest in the units of x; both lie
-        on the bounds, and their covariance knows of equalities only.
+        meet. ``"project"`` takes the most probable feasible state, ``"nearest"`` the one nearest in the units of x;
+        an estimate that breaks bounds then lies on them, and its covariance knows of equalities only.
     feedback : bool
         Whether the next row starts from the constrained belief. Covariances then become too small unless the
         constraint is news at each row.
@@ -62,8 +62,8 @@ class Constrained:
     Notes
     -----
     ``info["distance"]`` (T,) says by how many standard deviations the unconstrained estimate breaks its worst bound, 0
-    where it breaks none. A row more than 30 away is ``Status.REDUCED``, one that no state fulfils ``INFEASIBLE`` and keeps
-    its unconstrained estimate; the message names the bound. Intervals end at the bounds of a box.
+    where it breaks none. A row more than 30 away is ``Status.REDUCED``; one whose bounds no state fulfils is
+    ``INFEASIBLE`` and keeps its unconstrained estimate. The message names the bound. Intervals end at those of a box.
 
     Raises
     ------
@@ -79,12 +79,16 @@ class Constrained:
     array([0.46 , 0.822])
     """
 
-    method: Estimator = dataclasses.field(default_factory=KalmanFilter)
+    method: Any = dataclasses.field(default_factory=KalmanFilter)
     by: By = "ep"
     feedback: bool = False
 
     def __post_init__(self) -> None:
-        if isinstance(self.method, type) or not isinstance(self.method, Estimator) or isinstance(self.method, Constrained):
+        if (
+            isinstance(self.method, type)
+            or not isinstance(self.method, Estimator)
+            or isinstance(self.method, Constrained)
+        ):
             raise BadValue(f"`method` is {self.method!r}, a Gaussian estimator such as KalmanFilter() was expected")
         if self.by not in _BY:
             raise BadValue(f"`by` is {self.by!r}, one of {', '.join(map(repr, _BY))} was expected")
@@ -131,19 +135,19 @@ class Constrained:
             raise Refused(
                 f"`{typed(self.method)}` inside `Constrained` has no online form", hint="Constrained(KalmanFilter())"
             )
-        inner = self.method.init(replace(model, bounds=None))  # type: ignore[attr-defined]
+        inner = self.method.init(replace(model, bounds=None))
         if self.feedback and not {"x", "P"} <= set(getattr(inner, "_fields", ())):
             raise Refused(
-                f"the state of `{typed(self.method)}` is no named tuple with x and P, so nothing can be fed back into it",
+                f"the state of `{typed(self.method)}` is no named tuple with x and P, so nothing can be fed back",
                 hint="Constrained(..., feedback=False)",
             )
-        x, P, _ = self.method.belief(model, inner)  # type: ignore[attr-defined]
+        x, P, _ = self.method.belief(model, inner)
         return Held(inner, 0, x, P, 0, -1, 0.0)
 
     def step(self, model: Model, state: "Held", y: Array, u: Array | None, t: float, dt: float) -> "Held":
         """Return the belief after one row: the method's own state, and its belief inside the bounds."""
-        inner = self.method.step(model, state.inner, y, u, t, dt)  # type: ignore[attr-defined]
-        x, P, _ = self.method.belief(model, inner)  # type: ignore[attr-defined]
+        inner = self.method.step(model, state.inner, y, u, t, dt)
+        x, P, _ = self.method.belief(model, inner)
         held = hold(model, self.by, x[None], P[None])
         code = max(int(held.code[0]), getattr(inner, "code", 0))
         if self.feedback:
@@ -152,7 +156,7 @@ class Constrained:
 
     def belief(self, model: Model, state: "Held") -> tuple[Array, Array, float]:
         """Return mean and covariance inside the bounds, and the log-likelihood of the outputs."""
-        return state.x, state.P, float(self.method.belief(model, state.inner)[2])  # type: ignore[attr-defined]
+        return state.x, state.P, float(self.method.belief(model, state.inner)[2])
 
     def verdict(self, model: Model, state: "Held") -> tuple[int, str | None, tuple[Array, Array] | None]:
         """Return the code of the newest row, what there is to say of it, and the ends of intervals."""
