@@ -19,7 +19,7 @@ long constrain_place(Constraints& c, int n, int m, double* d, int* i, long* ints
     };
     c.n = n;
     take(c.F, K * N);
-    double** const rows[] = {&c.lo, &c.hi, &c.a, &c.b, &c.tol, &c.most, &c.tau, &c.nu, &c.lam, &c.rhs, &c.d, &c.di};
+    double** const rows[] = {&c.lo, &c.hi, &c.a, &c.b, &c.sd, &c.tol, &c.most, &c.tau, &c.nu, &c.lam, &c.rhs, &c.d, &c.di};
     double** const squares[] = {&c.G, &c.Ga, &c.Gf};
     int** const marks[] = {&c.of, &c.active, &c.side, &c.live, &c.alive};
     for (double** p : rows) take(*p, K);

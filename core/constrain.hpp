@@ -26,6 +26,7 @@ constexpr double constrain_slack = 1e-11;    // of numbers that differ by roundi
 constexpr double constrain_flat = 1e-13;     // a row's variance below this share of what it could be is none
 constexpr double constrain_rounding = 1e-14;  // a pivot below this share of the variance before is none
 constexpr double constrain_pinned = 1e-8;    // a cavity below this share of its belief cannot be found by subtraction
+constexpr double constrain_hopeless = 1e3;     // times what rounding explains that a mean may be left outside
 constexpr double constrain_idle = 8.5;          // sd beyond which a bound cuts off less than rounding
 constexpr double constrain_settled = 1e-5;      // of mean and variance, relative to the belief
 constexpr int constrain_sweeps = 60, constrain_undamped = 25;
@@ -39,7 +40,7 @@ struct Constraints {
     // workspace of one belief
     double *M, *g, *away;                     // (n,n) metric of the projection, (n,), (n,)
     double *a, *b;                            // (k,) bounds of F (x - its mean): a small move of a large number keeps its digits
-    double *s, *tol, *most, *tau, *nu, *lam;  // (k,) each
+    double *s, *sd, *tol, *most, *tau, *nu, *lam;  // (k,) each
     double *G, *Ga, *Gf, *rhs, *d, *di;       // (k,k) three times, (k,) each
     double* kept;                             // (n + n n,)
     int *active, *side, *live, *alive;        // (k,) each
@@ -133,29 +134,38 @@ inline void constrain_prepare(int m, const double* D, const double* lo, const do
     }
 }
 
-// away (n) <- the feasible point nearest to it in the metric M (n,n), over the live rows that are no equalities. Returns 0,
-// or 4 with the row that cannot be fulfilled.
-inline int constrain_project(Constraints& c, const double* M, double* x, int* row) {
+// What the variance of row i in the metric is measured by.
+inline double constrain_most_of(const Constraints& c, bool nearest, int i) {
+    return nearest ? constrain_dot(c.n, c.F + i * c.n, c.F + i * c.n) : c.most[i];
+}
+
+// x (n) <- the point nearest to it in the metric M (n,n) that fulfils the rows from `first` on; rows that M cannot move are
+// left out. Returns 0; 1 if it stopped before it was done; or 4 with the row that cannot be fulfilled.
+inline int constrain_project(Constraints& c, bool nearest, const double* M, int first_row, double* x, int* row) {
+    constexpr int free = 0, dependent = 2, fixed = 3;  // sides beside -1 and 1, those of rows that hold at an end
     const int n = c.n, k = c.k;
-    int count = 0;
-    for (int i = c.n_equal; i < k; i++) {
+    int count = 0, code = 1;
+    for (int i = first_row; i < k; i++) {
+        const double* f = c.F + i * n;
         c.lam[i] = 0.0;
-        c.side[i] = 0;
-        if (!c.live[i]) continue;
-        c.s[i] = constrain_dot(n, c.F + i * n, x);
-        constrain_times(n, M, c.F + i * n, c.g);
-        for (int j = c.n_equal; j <= i; j++) c.G[i * k + j] = c.G[j * k + i] = constrain_dot(n, c.F + j * n, c.g);
+        c.s[i] = constrain_dot(n, f, x);
+        constrain_times(n, M, f, c.g);
+        for (int j = first_row; j <= i; j++) c.G[i * k + j] = c.G[j * k + i] = constrain_dot(n, c.F + j * n, c.g);
+        c.side[i] = c.G[i * k + i] > constrain_flat * constrain_most_of(c, nearest, i) ? free : fixed;
     }
     for (int round = 0; round < 20 * (k + 1); round++) {
         int p = -1;
         double worst = 0.0;
-        for (int i = c.n_equal; i < k; i++) {
-            if (!c.live[i] || c.side[i]) continue;
+        for (int i = first_row; i < k; i++) {
+            if (c.side[i] != free) continue;
             const double sd = std::sqrt(max2(c.G[i * k + i], smallest));
             const double out = constrain_outside(c.s[i], c.a[i], c.b[i]);
             if (out > 1e-14 * sd + c.tol[i] && out / sd > worst) worst = out / sd, p = i;
         }
-        if (p < 0) break;
+        if (p < 0) {
+            code = 0;
+            break;
+        }
         const double sign = c.s[p] < c.a[p] ? 1.0 : -1.0, Gpp = c.G[p * k + p];
         for (;;) {  // ends: each turn but the last drops a row
             const int A = count;
@@ -165,22 +175,23 @@ inline int constrain_project(Constraints& c, const double* M, double* x, int* ro
             }
             ldl(Dim<0>(A), c.Ga, c.Gf, c.d, c.di);
             ldl_solve(Dim<0>(A), Dim<1>(), c.Gf, c.di, c.rhs);
-            double kappa = Gpp, first = HUGE_VAL;
+            double kappa = Gpp, first = HUGE_VAL, reach = std::sqrt(constrain_most_of(c, nearest, p));
             int leaves = -1;
             for (int a = 0; a < A; a++) {
                 const int j = c.active[a];
                 kappa -= c.G[j * k + p] * c.rhs[a];
-                if (sign * c.rhs[a] * c.side[j] > 0.0) {  // its multiplier falls towards 0
+                reach += std::fabs(c.rhs[a]) * std::sqrt(constrain_most_of(c, nearest, j));
+                if (j >= c.n_equal && sign * c.rhs[a] * c.side[j] > 0.0) {  // its multiplier falls towards 0
                     const double t = std::fabs(c.lam[j] / c.rhs[a]);
                     if (t < first) first = t, leaves = a;
                 }
             }
             const double out = sign > 0 ? c.a[p] - c.s[p] : c.s[p] - c.b[p];
-            const bool moves = kappa > constrain_flat * Gpp;
+            const bool moves = kappa > constrain_flat * reach * reach;  // kappa's own rounding grows with what it is left of
             const double full = moves ? out / kappa : HUGE_VAL, t = min2(first, full);
             if (t == HUGE_VAL) {
                 if (out <= 1e-9 * std::sqrt(Gpp) + 1e3 * c.tol[p]) {  // rounding, of rows that nearly depend on each other
-                    c.side[p] = 2;
+                    c.side[p] = dependent;
                     break;
                 }
                 *row = c.of[p];
@@ -188,8 +199,8 @@ inline int constrain_project(Constraints& c, const double* M, double* x, int* ro
             }
             c.lam[p] += sign * t;
             for (int a = 0; a < A; a++) c.lam[c.active[a]] -= sign * t * c.rhs[a];
-            for (int i = c.n_equal; i < k; i++) {
-                if (!c.live[i]) continue;
+            for (int i = first_row; i < k; i++) {
+                if (c.side[i] == dependent) c.side[i] = free;
                 double step = c.G[i * k + p];
                 for (int a = 0; a < A; a++) step -= c.G[i * k + c.active[a]] * c.rhs[a];
                 c.s[i] += sign * t * step;
@@ -200,24 +211,28 @@ inline int constrain_project(Constraints& c, const double* M, double* x, int* ro
                 break;
             }
             c.lam[c.active[leaves]] = 0.0;
-            c.side[c.active[leaves]] = 0;
+            c.side[c.active[leaves]] = free;
             for (int a = leaves; a + 1 < count; a++) c.active[a] = c.active[a + 1];
             count--;
         }
     }
-    for (int i = c.n_equal; i < k; i++) {
-        if (!c.live[i] || c.lam[i] == 0.0) continue;
+    for (int i = first_row; i < k; i++) {
+        if (c.lam[i] == 0.0) continue;
         constrain_times(n, M, c.F + i * n, c.g);
         for (int j = 0; j < n; j++) x[j] += c.lam[i] * c.g[j];
     }
-    return 0;
+    return code;
 }
 
-// Does x obey every live row?
-inline bool constrain_obeys(const Constraints& c, const double* x) {
-    for (int i = c.n_equal; i < c.k; i++)
-        if (c.live[i] && constrain_outside(constrain_dot(c.n, c.F + i * c.n, x), c.a[i], c.b[i]) > c.tol[i]) return false;
-    return true;
+// How far x is outside, beside what rounding explains: at most 1 where it obeys. `row`: the row of D that is broken most.
+inline double constrain_broken(const Constraints& c, const double* x, int* row) {
+    double worst = 0.0;
+    for (int i = 0; i < c.k; i++) {
+        const double slack = 1e-10 * c.sd[i] + constrain_slack * std::sqrt(c.most[i]) + 100 * c.tol[i];
+        const double out = constrain_outside(constrain_dot(c.n, c.F + i * c.n, x), c.a[i], c.b[i]) / max2(slack, smallest);
+        if (out > worst) worst = out, *row = c.of[i];
+    }
+    return worst;
 }
 
 // Rows of one entry hold to the last bit.
@@ -266,8 +281,7 @@ inline int constrain_equal(Constraints& c, bool nearest, double* P, int* row) {
         const double* f = c.F + i * n;
         constrain_times(n, c.M, f, c.g);
         const double v = constrain_dot(n, f, c.g), out = c.a[i] - constrain_dot(n, f, c.away);
-        const double most = nearest ? constrain_dot(n, f, f) : c.most[i];
-        if (!(v > constrain_flat * most)) {  // nothing is left to move: it holds already, or never
+        if (!(v > constrain_flat * constrain_most_of(c, nearest, i))) {  // nothing is left to move: it holds already, or never
             if (std::fabs(out) > constrain_slack * std::sqrt(c.most[i]) + 1e3 * c.tol[i]) {
                 *row = c.of[i];
                 return 4;
@@ -347,7 +361,7 @@ inline void constrain_repair(int n, const double* P, double* S, double* L) {
 }
 
 // One belief N(x, P), in place. `distance`: the standard deviations from x to the farthest constraint that it breaks.
-// Returns 0; 1 if the iteration stopped before it settled; 2 if a constraint lies more than `constrain_far` standard
+// Returns 0; 1 if the iteration stopped before it settled or rounding left the mean outside; 2 if a constraint lies more than `constrain_far` standard
 // deviations away; 4 if nothing fulfils row `row` of D, and then x and P stay. Codes 2 and 4 name the row.
 inline int constrain_row(Constraints& c, int by, double* x, double* P, double* distance, int* row) {
     const int n = c.n, k = c.k;
@@ -361,7 +375,6 @@ inline int constrain_row(Constraints& c, int by, double* x, double* P, double* d
         c.away[i] = 0.0;
         for (int j = 0; j < n; j++) c.M[i * n + j] = nearest ? double(i == j) : P[i * n + j];
     }
-    bool obeys = c.n_equal == 0;
     for (int i = 0; i < k; i++) {
         const double* f = c.F + i * n;
         const double s = constrain_dot(n, f, x);
@@ -371,13 +384,11 @@ inline int constrain_row(Constraints& c, int by, double* x, double* P, double* d
         c.tol[i] = 8 * eps * (constrain_size(n, f, x) + min2(std::fabs(c.lo[i]), std::fabs(c.hi[i])));
         c.most[i] = constrain_most(n, P, f);
         c.live[i] = 1;
-        const double out = constrain_outside(0.0, c.a[i], c.b[i]);
-        if (out <= c.tol[i]) continue;
-        obeys = false;
         constrain_times(n, P, f, c.g);
-        const double v = constrain_dot(n, f, c.g);
-        if (v > constrain_flat * c.most[i] && out > *distance * std::sqrt(v)) {
-            *distance = out / std::sqrt(v);
+        const double v = constrain_dot(n, f, c.g), out = constrain_outside(0.0, c.a[i], c.b[i]);
+        c.sd[i] = v > constrain_flat * c.most[i] ? std::sqrt(v) : 0.0;
+        if (out > c.tol[i] && out > *distance * c.sd[i] && c.sd[i] > 0.0) {
+            *distance = out / c.sd[i];
             *row = c.of[i];
         }
     }
@@ -390,7 +401,7 @@ inline int constrain_row(Constraints& c, int by, double* x, double* P, double* d
     for (int i = c.n_equal; i < k; i++) {  // what has no variance left cannot be moved
         const double* f = c.F + i * n;
         constrain_times(n, c.M, f, c.g);
-        const double most = nearest ? constrain_dot(n, f, f) : c.most[i];
+        const double most = constrain_most_of(c, nearest, i);
         c.live[i] = c.alive[i] = constrain_dot(n, f, c.g) > constrain_flat * most;
         const double out = constrain_outside(constrain_dot(n, f, c.away), c.a[i], c.b[i]);
         if (!c.live[i] && out > constrain_slack * std::sqrt(c.most[i]) + 1e3 * c.tol[i]) {
@@ -399,27 +410,35 @@ inline int constrain_row(Constraints& c, int by, double* x, double* P, double* d
             return 4;
         }
     }
-    int code = 0;
-    if (!obeys || c.n_equal) {
-        copy(Dim<0>(n), c.away, kept);
-        if (constrain_project(c, c.M, kept, row)) {
+    // The projection is also what proves that something fulfils all rows, and the answer where cuts end outside.
+    copy(Dim<0>(n), c.away, kept);
+    if (constrain_project(c, nearest, c.M, c.n_equal, kept, row) == 4) {
+        copy(Dim<0>(n * n), kept + n, P);
+        return 4;
+    }
+    int code = 0, at;
+    const bool cuts = by == constrain_by_ep || by == constrain_by_truncation;
+    if (cuts) {
+        code = constrain_cuts(c, by, P);
+        // Cuts one after the other may leave an earlier constraint; the mean is moved back, in the metric of what is left.
+        if (constrain_broken(c, c.away, &at) > 1.0) constrain_project(c, false, P, c.n_equal, c.away, &at);
+    }
+    if (!cuts || constrain_broken(c, c.away, &at) > 1.0) {
+        // Rows that nearly depend on each other lose digits: all of them are projected on once more.
+        for (int i = 0; nearest && i < n; i++)
+            for (int j = 0; j < n; j++) c.M[i * n + j] = double(i == j);
+        for (int again = 0; again < 3 && constrain_broken(c, kept, &at) > 1.0; again++)
+            constrain_project(c, nearest, nearest ? c.M : kept + n, 0, kept, &at);
+        copy(Dim<0>(n), kept, c.away);
+        const double broken = constrain_broken(c, c.away, &at);
+        if (broken > constrain_hopeless) {  // no proof, but P leaves no way in that numbers can show
+            *row = at;
             copy(Dim<0>(n * n), kept + n, P);
             return 4;
         }
-    } else {
-        copy(Dim<0>(n), c.away, kept);
+        if (broken > 1.0) code = 1;
     }
-    if (by == constrain_by_ep || by == constrain_by_truncation) {
-        code = constrain_cuts(c, by, P);
-        // Cuts one after the other may leave an earlier constraint; what they left is moved back, in its own metric.
-        if (!constrain_obeys(c, c.away)) {
-            int at;
-            if (constrain_project(c, P, c.away, &at) || !constrain_obeys(c, c.away)) copy(Dim<0>(n), kept, c.away);
-        }
-    } else {
-        copy(Dim<0>(n), kept, c.away);
-    }
-    if (c.n_equal || by == constrain_by_ep || by == constrain_by_truncation) constrain_repair(n, kept + n, P, c.M);
+    if (c.n_equal || cuts) constrain_repair(n, kept + n, P, c.M);
     for (int i = 0; i < n; i++) x[i] += c.away[i];
     constrain_clip(c, x);
     return *distance > constrain_far ? 2 : code;

@@ -273,6 +273,35 @@ def test_answers_are_feasible_symmetric_and_not_wider(by):
             assert np.linalg.eigvalsh(P - S)[0] >= -1e-9 * np.abs(P).max()
 
 
+@pytest.mark.parametrize("by", [EP, TRUNCATE, PROJECT])
+def test_ill_conditioned_beliefs_end_inside_or_say_so(by):
+    """Singular or nearly singular P, thin slabs, equalities: a good code means feasible, whatever P allows."""
+    rng = np.random.default_rng(14)
+    kinds = {0: 0, 4: 0}
+    for _ in range(1500):
+        n, m = int(rng.integers(2, 4)), int(rng.integers(1, 5))
+        B = rng.standard_normal((n, n)) * 10.0 ** rng.uniform(-6, 0, n)
+        if rng.random() < 0.5:
+            B[:, -1] = 0.0
+        P, D, inside = B @ B.T, rng.standard_normal((m, n)), rng.standard_normal(n)
+        s, width = D @ inside, 10.0 ** rng.uniform(-8, 1, m)
+        lo, hi = s - width * rng.random(m), s + width * rng.random(m)
+        lo[rng.random(m) < 0.3], hi[rng.random(m) < 0.3] = -inf, inf
+        x = inside + (B @ rng.standard_normal(n) if rng.random() < 0.5 else rng.standard_normal(n))
+        X, S, _, code, row = run(by, x, P, D, lo, hi)
+        kinds[code] = kinds.get(code, 0) + 1
+        assert np.isfinite(X).all()
+        assert np.linalg.eigvalsh(S)[0] >= -1e-12 * np.abs(P).max()
+        if code == 4:
+            assert 0 <= row < m
+            np.testing.assert_array_equal(X, x)
+        else:
+            out = np.maximum(lo - D @ X, D @ X - hi)
+            slack = 1e-7 * np.sqrt(np.einsum("ij,jk,ik->i", D, P, D).clip(0)) + 1e-11 * (1 + np.abs(D) @ np.abs(X))
+            assert np.all(out <= slack)
+    assert min(kinds[0], kinds[4]) > 100
+
+
 @pytest.mark.parametrize("by", [EP, TRUNCATE])
 def test_narrow_slabs_are_nearly_equalities(by):
     P = np.array([[1.0, 0.5], [0.5, 2.0]])

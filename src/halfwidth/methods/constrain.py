@@ -38,7 +38,9 @@ from halfwidth.spread import Box, Normal
 
 By = Literal["ep", "truncate", "project", "nearest"]
 _BY = ("ep", "truncate", "project", "nearest")  # in the order of the core's numbers
-#: Codes of the core, from good to bad; 1 (cuts not settled) is told as 2.
+#: In place of a row of D: the cuts did not settle to the last digit; the method inside has something to say.
+_UNSETTLED, _OF_THE_METHOD = -2, -3
+#: Codes of the core, from good to bad; 1 (not settled) is told as 2.
 _STATUS = {0: Status.OK, 2: Status.REDUCED, 3: Status.COLLAPSED, 4: Status.INFEASIBLE}
 
 
@@ -149,10 +151,12 @@ class Constrained:
         inner = self.method.step(model, state.inner, y, u, t, dt)
         x, P, _ = self.method.belief(model, inner)
         held = hold(model, self.by, x[None], P[None])
-        code = max(int(held.code[0]), getattr(inner, "code", 0))
+        code, at = int(held.code[0]), int(held.row[0])
+        if code == 0 and getattr(inner, "code", 0) >= 2:
+            code, at = inner.code, _OF_THE_METHOD
         if self.feedback:
             inner = inner._replace(x=held.x[0], P=held.P[0])
-        return Held(inner, state.rows + 1, held.x[0], held.P[0], code, int(held.row[0]), float(held.distance[0]))
+        return Held(inner, state.rows + 1, held.x[0], held.P[0], code, at, float(held.distance[0]))
 
     def belief(self, model: Model, state: "Held") -> tuple[Array, Array, float]:
         """Return mean and covariance inside the bounds, and the log-likelihood of the outputs."""
@@ -240,12 +244,17 @@ def hold(model: Model, by: By, x: Array, P: Array) -> _Held:
     assert model.bounds is not None
     D, lo, hi = (np.ascontiguousarray(a) for a in model.bounds.rows)
     found = _Held(*_core.constrain_run(_BY.index(by), np.ascontiguousarray(x), np.ascontiguousarray(P), D, lo, hi))
-    return found._replace(code=np.where(found.code == 1, 2, found.code))
+    loose = found.code == 1
+    return found._replace(code=np.where(loose, 2, found.code), row=np.where(loose, _UNSETTLED, found.row))
 
 
 def _said(model: Model, code: int, row: int, distance: float) -> str:
-    if row < 0:  # the method inside had to give way, or the cuts did not settle
-        return "the row contradicts what the model holds for certain, or its cuts did not settle"
+    if row == _UNSETTLED:
+        return "bounds that nearly depend on each other were met with fewer digits than usual"
+    if code == 3:
+        return "the state left the range of floating point"
+    if row == _OF_THE_METHOD:
+        return "its outputs contradict what the model holds for certain"
     which = f"the bounds of `{model.names.x[row]}`" if isinstance(model.bounds, Box) else f"row {row} of `bounds`"
     if code == 4:
         return f"no state fulfils {which} beside the other bounds and what the model holds for certain"
