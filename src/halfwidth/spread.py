@@ -161,7 +161,7 @@ class Halfspaces:
         return self.D, self.lo, self.hi
 
     def contains(self, x: Array) -> NDArray[np.bool_]:
-        """Return which of the states (..., nx) obey every row."""
+        """Return which of the states (..., nx) obey every row, to the last bit: rounding may leave a plane."""
         s = x @ self.D.T
         return np.asarray(((s >= self.lo) & (s <= self.hi)).all(axis=-1))
 
