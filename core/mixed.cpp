@@ -6,7 +6,7 @@ namespace HW_ISA {
 
 long mixed_workspace(const MixedArgs& a) {
     const long n = a.n;
-    return 6 * n * n + 8 * n + a.capacity + a.ng + a.ny;
+    return 6 * n * n + 9 * n + a.capacity + a.ng + a.ny;
 }
 
 void mixed_run(MixedArgs& a, double* work) {
@@ -18,7 +18,7 @@ void mixed_run(MixedArgs& a, double* work) {
     };
     MixedBuffers b;
     double** const square[] = {&b.F, &b.Ft, &b.out, &b.work, &b.P, &b.X};
-    double** const vector[] = {&b.w, &b.Pc, &b.Xc, &b.K, &b.g, &b.row, &b.last, &b.m};
+    double** const vector[] = {&b.w, &b.Pc, &b.Xc, &b.K, &b.g, &b.row, &b.last, &b.root, &b.m};
     for (double** one : square) *one = take(nn);
     for (double** one : vector) *one = take(n);
     b.key = take(a.capacity + a.ng + a.ny);

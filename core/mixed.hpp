@@ -23,14 +23,14 @@ namespace HW_ISA {
 constexpr double mixed_least = 1e-9;   // a stays this far from 0 and 1: the set grows by as much at most
 constexpr double mixed_far = 38.0;     // standard deviations beyond which a density is 0 in floating point
 constexpr int mixed_halvings = 32;     // of the odds a / (1 - a), from 1e-9 to 1e9: 1e-8 relative
-constexpr int mixed_grid = 21;         // first look where there may be several minima
+constexpr int mixed_nodes = 33;        // first look where there may be several minima
 constexpr int mixed_golden = 40;
 
 struct MixedBuffers {
     double *F, *Ft, *out, *work;         // (n, n) each
     double *w, *Pc, *Xc, *K, *g, *row;   // (n,) each
-    double* last;                        // (n,) half-widths after the row before
-    double *key;                         // (capacity + ng + ny,)
+    double *last, *root;                 // (n,): half-widths after the row before, roots of a diagonal
+    double* key;                         // (capacity + ng + ny,)
     double *P, *X, *m;                   // the belief
 };
 
@@ -39,34 +39,41 @@ template <class N>
 struct MixedRow {
     N n;
     const double *P, *X, *w, *Pc, *Xc;
-    double kappa2, sp, sx, r, E, weight;  // sp = c'Pc, sx = c'Xc, E = half^2, weight of the output's direction
-    double tau;                           // P+ = P_kalman + tau g g', g = K (sp + r) - P c: 1/(sp + r) without truncation
-    double w1, p0, p1, p2, s0;            // tr(W X), u'Wu, u'Wv, v'Wv for u = kappa^2 P c, v = X c; constant part of S
+    double kappa2, sp, sx, r, E;  // sp = c'Pc, sx = c'Xc, E = half^2
+    double weight = 0.0;          // of the output's direction
+    double tau = 0.0;             // P+ = P_kalman + tau g g', g = K (sp + r) - P c: 1/(sp + r) without truncation
+    // With u = kappa^2 P c, v = X c and t = u - v c'u / c'v, which c does not see: u'Wu, u'Wv, v'Wv, v'Wt, t'Wt, and
+    // tr(W (X - v v' / c'v)), the set that no gain reaches.
+    double uu = 0.0, uv = 0.0, vv = 0.0, vt = 0.0, tt = 0.0, rest = 0.0;
 
     void prepare(const double* weights, double output) {
         w = weights;
-        const double norm = kappa2 * sp + sx;
+        const double norm = kappa2 * sp + sx, share = sx > 0.0 ? kappa2 * sp / sx : 0.0;
         weight = norm > 0.0 ? output / norm : 0.0;
-        w1 = weight * sx;
-        p0 = weight * kappa2 * sp * kappa2 * sp;
-        p1 = weight * kappa2 * sp * sx;
-        p2 = weight * sx * sx;
+        uu = weight * kappa2 * sp * kappa2 * sp;
+        uv = weight * kappa2 * sp * sx;
+        vv = weight * sx * sx;
+        double trace = weight * sx;
+        vt = tt = 0.0;
         for (int i = 0; i < n; i++) {
-            const double u = kappa2 * Pc[i], v = Xc[i];
-            w1 += w[i] * X[i * n + i];
-            p0 += w[i] * u * u;
-            p1 += w[i] * u * v;
-            p2 += w[i] * v * v;
+            const double u = kappa2 * Pc[i], v = Xc[i], t = u - share * v;
+            trace += w[i] * X[i * n + i];
+            uu += w[i] * u * u;
+            uv += w[i] * u * v;
+            vv += w[i] * v * v;
+            vt += w[i] * v * t;
+            tt += w[i] * t * t;
         }
-        s0 = kappa2 * (sp + r);
+        rest = sx > 0.0 ? trace - vv / sx : trace;
+        if (rest < 1e-14 * trace) rest = 0.0;  // rounding: the set is a segment along v
     }
 
-    // Derivative of kappa^2 tr(W P+) + tr(W X+) in a, times a positive number: alpha = 1/a, beta = 1/(1-a).
+    // Derivative in a of kappa^2 tr(W P+) + tr(W X+), times S^2: by the envelope theorem
+    // -alpha^2 tr(W F X F') + beta^2 E K'WK with F = I - K c', alpha = 1/a, beta = 1/(1-a), and free of cancellation.
     double slope(double alpha, double beta) const {
-        const double S = s0 + alpha * sx + beta * E, top = p0 + alpha * (2.0 * p1 + alpha * p2);
-        const double a2 = alpha * alpha;
-        const double top_a = -2.0 * (p1 + alpha * p2) * a2, S_a = beta * beta * E - a2 * sx;
-        return -w1 * a2 * S * S - top_a * S + top * S_a;
+        const double S = kappa2 * (sp + r) + alpha * sx + beta * E, left = kappa2 * r + beta * E;
+        const double reached = sx > 0.0 ? (left * (left * vv / sx - 2.0 * vt) + tt * sx) : 0.0;
+        return beta * beta * E * (uu + alpha * (2.0 * uv + alpha * vv)) - alpha * alpha * (rest * S * S + reached);
     }
 
     // K of one alpha, beta; false if nothing is left to divide by.
@@ -127,10 +134,13 @@ double mixed_search(const MixedRow<N>& row, bool width, bool set, const double* 
         const double alpha = 1.0 / a, beta = 1.0 / (1.0 - a);
         return row.gain(alpha, beta, set, K) ? row.cost(alpha, beta, width, c, K) : HUGE_VAL;
     };
-    auto node = [](int k) { return min2(max2(k / (mixed_grid - 1.0), mixed_least), 1.0 - mixed_least); };
+    auto node = [](int k) {  // 0, 1/20, ..., 1, and towards both ends a node a decade
+        constexpr double ends[] = {mixed_least, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2};
+        return k < 7 ? ends[k] : k >= mixed_nodes - 7 ? 1.0 - ends[mixed_nodes - 1 - k] : 0.05 * (k - 6);
+    };
     int best = 0;
     double least = HUGE_VAL;
-    for (int k = 0; k < mixed_grid; k++) {
+    for (int k = 0; k < mixed_nodes; k++) {
         const double found = at(node(k));
         if (found < least) {
             least = found;
@@ -138,7 +148,7 @@ double mixed_search(const MixedRow<N>& row, bool width, bool set, const double* 
         }
     }
     constexpr double golden = 0.61803398874989485;
-    double lo = node(best > 0 ? best - 1 : 0), hi = node(best < mixed_grid - 1 ? best + 1 : best);
+    double lo = node(best > 0 ? best - 1 : 0), hi = node(best < mixed_nodes - 1 ? best + 1 : best);
     double l = hi - golden * (hi - lo), r = lo + golden * (hi - lo), cl = at(l), cr = at(r);
     for (int k = 0; k < mixed_golden; k++) {
         if (cl <= cr) {
@@ -183,7 +193,7 @@ int mixed_reduce(N n, int capacity, int count, const double* w, double* Z, doubl
             sum += s;
             most = max2(most, s);
         }
-        key[j] = sum - most;  // what boxing it alone would add (Girard 2005)
+        key[j] = sum - most + 1e-6 * sum;  // what boxing it alone would add (Girard 2005); of equals the smallest
     }
     fill(n, 0.0, box);
     for (int away = count - (capacity - n); away > 0; away--) {
@@ -203,12 +213,31 @@ int mixed_reduce(N n, int capacity, int count, const double* w, double* Z, doubl
     return count;
 }
 
-// x <- F x F' + s k k', symmetric (n, n), in place
+// x c (n,) and c'x c, both 0 where c'x c is nothing but rounding: c sees nothing of what x holds.
+template <class N>
+double mixed_seen(N n, const double* x, const double* c, double* xc) {
+    mul_v(n, n, x, c, xc);
+    const double s = dot(n, c, xc);
+    double reach = 0.0;
+    for (int i = 0; i < n; i++) reach += std::fabs(c[i]) * std::sqrt(max2(x[i * n + i], 0.0));
+    if (s > tiny_pivot(n) * reach * reach) return s;
+    fill(n, 0.0, xc);
+    return 0.0;
+}
+
+// x <- scale F x F' + s k k', symmetric (n, n), in place. An entry that is left with rounding alone is known exactly.
 template <class N>
 void mixed_joseph(N n, const MixedBuffers& b, double s, const double* k, double scale, double* x) {
+    for (int i = 0; i < n; i++) b.root[i] = std::sqrt(max2(x[i * n + i], 0.0));
     congruence(n, n, b.F, b.Ft, x, nullptr, b.out, b.work);
     for (int i = 0; i < n; i++)
         for (int j = 0; j < n; j++) x[i * n + j] = scale * b.out[i * n + j] + s * (k[i] * k[j]);
+    for (int i = 0; i < n; i++) {
+        double reach = 0.0;
+        for (int j = 0; j < n; j++) reach += std::fabs(b.F[i * n + j]) * b.root[j];
+        if (x[i * n + i] > tiny_pivot(n) * scale * reach * reach) continue;
+        for (int j = 0; j < n; j++) x[i * n + j] = x[j * n + i] = 0.0;
+    }
 }
 
 template <class N>
@@ -255,7 +284,7 @@ void mixed_predict(N n, MixedArgs& a, const MixedBuffers& b, long t) {
             if (!(b.key[j] > 0.0)) continue;
             const double s = sum / b.key[j];
             for (int i = 0; i < n; i++)
-                for (int l = 0; l < n; l++) b.X[i * n + l] += s * G[i * a.ng + j] * G[l * a.ng + j];
+                for (int l = 0; l < n; l++) b.X[i * n + l] += s * (G[i * a.ng + j] * G[l * a.ng + j]);
         }
     }
     if (zonotope) {
@@ -276,14 +305,19 @@ void mixed_correct(N n, MixedArgs& a, const MixedBuffers& b, long t, int i) {
     const double *c = a.C.at(t) + i * n, y = a.y[t * a.ny + i], r = a.r.at(t)[i], half = a.half.at(t)[i];
     const bool ellipsoid = a.form != mixed_zonotope, zonotope = a.form != mixed_ellipsoid;
     const double kappa2 = a.kappa * a.kappa;
-    MixedRow<N> row{n, b.P, b.X, b.w, b.Pc, b.Xc, kappa2, 0.0, 0.0, r, half * half, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
-    mul_v(n, n, b.P, c, b.Pc);
-    row.sp = max2(dot(n, c, b.Pc), 0.0);
+    MixedRow<N> row{n, b.P, b.X, b.w, b.Pc, b.Xc, kappa2, 0.0, 0.0, r, half * half};
+    row.sp = mixed_seen(n, b.P, c, b.Pc);
     double reach = 0.0;  // half-width of the set along c
     if (zonotope) {
         fill(n, 0.0, b.Xc);
         for (int j = 0; j < a.count; j++) {
-            const double s = dot(n, c, a.Z + j * n);
+            double s = 0.0, size = 0.0;
+            for (int k = 0; k < n; k++) {
+                const double part = c[k] * a.Z[j * n + k];
+                s += part;
+                size += std::fabs(part);
+            }
+            if (std::fabs(s) <= tiny_pivot(n) * size) s = 0.0;  // nothing but rounding
             b.key[j] = s;
             reach += std::fabs(s);
             axpy(n, s, a.Z + j * n, b.Xc);
@@ -291,8 +325,7 @@ void mixed_correct(N n, MixedArgs& a, const MixedBuffers& b, long t, int i) {
         row.sx = dot(n, c, b.Xc);
     }
     if (ellipsoid) {
-        mul_v(n, n, b.X, c, b.Xc);
-        row.sx = max2(dot(n, c, b.Xc), 0.0);
+        row.sx = mixed_seen(n, b.X, c, b.Xc);
         reach = zonotope ? min2(reach, std::sqrt(row.sx)) : std::sqrt(row.sx);
     }
     const double predicted = dot(n, c, b.m), nu = y - predicted, S = row.sp + r, B = reach + half;
