@@ -21,6 +21,7 @@ _HOME: dict[str, str] = {
     "Mixed": "noise",
     "Box": "spread",
     "Normal": "spread",
+    "Both": "spread",
     "Cloud": "spread",
     "Bernoulli": "loss",
     "Markov": "loss",
@@ -87,6 +88,8 @@ if TYPE_CHECKING:
     from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
     from halfwidth.methods.loss import Runnalls as Runnalls
     from halfwidth.methods.map import BatchLP as BatchLP
+    from halfwidth.methods.mixed import MixedFilter as MixedFilter
+    from halfwidth.methods.mixed_window import MixedWindow as MixedWindow
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
@@ -105,10 +108,11 @@ if TYPE_CHECKING:
     from halfwidth.result import Status as Status
     from halfwidth.score import score as score
     from halfwidth.simulate import simulate as simulate
+    from halfwidth.spread import Both as Both
     from halfwidth.spread import Box as Box
     from halfwidth.spread import Cloud as Cloud
     from halfwidth.spread import Normal as Normal
     from halfwidth.stream import resume as resume
     from halfwidth.stream import stream as stream
 
-lazy(__name__, _HOME | {"vehicle": "vehicle"})
+lazy(__name__, _HOME | {"vehicle": "vehicle", "fusion": "fusion"})

@@ -21,6 +21,7 @@ ESTIMATORS: dict[str, str] = {
     "SequentialLP": "sequential",
     "Window": "window",
     "MixedFilter": "mixed",
+    "MixedWindow": "mixed_window",
 }
 
 

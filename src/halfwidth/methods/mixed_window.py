@@ -1,0 +1,402 @@
+"""The optimal affine estimator for mixed noise, over a sliding window.
+
+Of all estimates that are affine in the outputs of a window, ``x = sum_j D_j b_j + D_0 m + L y``, the one is taken whose
+worst half-width is least: with the coefficients of the error, ``D_j = D_{j+1} A_{j+1} + [j is the target] I - L_j C_j``,
+
+    minimise  sum_j |D_j G_j| + |L| half + |X^{1/2} D_0'|  +  kappa |(P^{1/2} D_0', Q_j^{1/2} D_j', r^{1/2} L')|
+
+for each state, a second-order cone program [1]_. The first terms bound what the bounded noises can do, whatever they do,
+the last is the standard deviation. The program knows no data, so gains are found once for each pattern of seen outputs,
+and in a time-invariant model nearly all rows share a few. What is known before the window, (m, P, X), is the belief of
+`MixedFilter`; gains are found for P and X rounded to a grid, and half-widths then computed for those gains with the belief
+itself, so they hold exactly for what is reported.
+
+References
+----------
+.. [1] Donoho (1994), Statistical estimation and optimal recovery, Ann. Statist. 22(1).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.array import Array
+from halfwidth.errors import BadValue, Missing
+from halfwidth.methods._mixed_rows import MixedRows, Stack, mixed_rows, refuses
+from halfwidth.methods._protocol import typed
+from halfwidth.methods.mixed import MixedBelief, MixedFilter, prior
+from halfwidth.model import Linear, Model
+from halfwidth.noise import Gaussian
+from halfwidth.record import Record
+from halfwidth.result import Estimate, Status
+from halfwidth.spread import Both
+
+
+@dataclass(frozen=True)
+class MixedWindow:
+    """Centre, covariance and set of each state by the optimal affine estimator over the newest rows.
+
+    Needs the library clarabel (``pip install 'halfwidth[mixed]'``). A design takes some milliseconds a state, so a record
+    in which every row has its own pattern of missing outputs takes as long as many designs; `MixedFilter` takes
+    microseconds, at half-widths a few per cent larger.
+
+    Parameters
+    ----------
+    memory : int
+        Rows in the window; what is known before them comes from `MixedFilter`.
+    lag : int
+        Row t uses the outputs up to row t + lag, so this is also the smoother for mixed noise.
+    kappa : float
+        Standard deviations that count as much as a half-width.
+
+    Examples
+    --------
+    >>> import halfwidth as hw
+    >>> walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(0.01), hw.Uniform(1) + hw.Gaussian(0.1), hw.Normal([0.0], 1.0))
+    >>> est = hw.estimate(walk, hw.Record(range(60), np.zeros(60)), MixedWindow(memory=20))
+    >>> filtered = hw.estimate(walk, hw.Record(range(60), np.zeros(60)), hw.MixedFilter())
+    >>> bool(est.spread.plain()[1][-1, 0] < filtered.spread.plain()[1][-1, 0])
+    True
+    """
+
+    memory: int = 40
+    lag: int = 0
+    kappa: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name, least in (("memory", 1), ("lag", 0)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+                raise BadValue(f"`{name}` is {value!r}, a whole number from {least} was expected")
+        if self.memory <= self.lag:
+            raise BadValue(
+                f"`memory` is {self.memory} rows but `lag` is {self.lag}, so the row would lie before its window",
+                hint=f"memory={4 * self.lag}",
+            )
+        if not 0.0 < self.kappa < np.inf:
+            raise BadValue(f"`kappa` is {self.kappa!r}, a positive number was expected", hint="kappa=3.0")
+
+    def refuses(self, model: Model) -> str | None:
+        """Return why the model cannot be taken, or None."""
+        reason = refuses(model, type(self).__name__)
+        if reason is None and isinstance(model.w, Gaussian) and isinstance(model.e, Gaussian):
+            return "`MixedWindow` is for bounded noise but `w` and `e` are `Gaussian`\nhint: KalmanSmoother()"
+        return reason
+
+    def run(self, model: Linear, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
+        """Estimate every row from the window about it."""
+        T, n = len(record), model.nx
+        rows, start = mixed_rows(model, record), prior(model)
+        out = MixedFilter(form="ellipsoid", kappa=self.kappa).rows(rows, start)
+        filtered = MixedBelief(out["m"], out["P"], out["X"], np.zeros((0, n)))
+        x, P, half = out["m"].copy(), out["P"].copy(), out["half"].copy()
+        groups = list(self._groups(rows, start, filtered))
+        failed = []
+        for at, window, arrival in groups:
+            found = design(window, arrival, self.kappa)
+            if found is None:
+                failed.extend(at.tolist())
+                continue
+            first = at - window.target
+            before = first - 1
+            m, S, X = (
+                np.broadcast_to(prior_part, (len(at), *prior_part.shape)) if first[0] == 0 else part[before]
+                for prior_part, part in zip(start[:3], filtered[:3], strict=True)
+            )
+            inside = first[:, None] + np.arange(window.rows)
+            y = rows.y[inside].reshape(len(at), -1)[:, window.seen.ravel()]
+            b = None if rows.b is None else rows.b[inside].reshape(len(at), -1)
+            x[at] = m @ found.D0.T + y @ found.L.T + (0.0 if b is None else b @ found.D.T)
+            P[at] = found.D0 @ S @ found.D0.T + found.P
+            set_ = np.abs(found.D0 @ start.Z.T).sum(axis=1) if first[0] == 0 else _reach(found.D0, X)
+            half[at] = set_ + found.half
+        info: dict[str, Any] = {"designs": len(groups)}
+        status = Status.OK
+        if out["broken"] >= 0:
+            status = Status.COLLAPSED
+            info["message"] = f"the state left the range of floating point at t = {record.t[out['broken']]:.6g} s"
+        elif failed:
+            status = Status.REDUCED
+            info["message"] = f"{len(failed)} rows have the filter's estimate, first t = {record.t[min(failed)]:.6g} s"
+        return Estimate(
+            record.t, x, Both(x, 0.5 * (P + np.swapaxes(P, 1, 2)), half), status, typed(self),
+            names=model.names.x, labels=record.labels, info=info,
+        )  # fmt: skip
+
+    def _groups(
+        self, rows: MixedRows, start: MixedBelief, filtered: MixedBelief
+    ) -> Iterator[tuple[NDArray[np.int64], "_Window", MixedBelief]]:
+        """Give the rows that share a design, their window, and the belief before it that the design is made for."""
+        T = len(rows.y)
+        end = np.minimum(np.arange(T) + self.lag, T - 1)
+        first = np.maximum(end - self.memory + 1, 0)
+        motion, output = (_index(stack, T) for stack in (rows.A, rows.C))
+        kind = motion * (int(output.max()) + 1) + output
+        inside = first[:, None] + np.arange(self.memory)
+        kinds = np.where(inside <= end[:, None], kind[np.minimum(inside, T - 1)], -1)
+        rounded = np.concatenate([_grid(S) for S in filtered[1:3]], axis=1)
+        arrival = np.where(first[:, None] > 0, rounded[np.maximum(first - 1, 0)], _NONE)
+        keys = np.column_stack([np.arange(T) - first, kinds, arrival])
+        _, one, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        order = np.argsort(which.reshape(-1), kind="stable")
+        for at in np.split(order, np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1):
+            t = int(one[which.reshape(-1)[at[0]]])
+            a, e = int(first[t]), int(end[t])
+            belief = start if a == 0 else MixedBelief(start.m, *(_of_grid(g) for g in _halves(rounded[a - 1])), start.Z)
+            yield at, _window(rows, motion, output, a, e, t - a), belief
+
+
+_NONE = np.iinfo(np.int64).min
+
+
+class _Window(NamedTuple):
+    """The matrices of a window's rows, (rows, ., .), the outputs seen in them (rows, ny), and which row is asked for."""
+
+    A: Array
+    Q: Array
+    G: Array
+    C: Array
+    r: Array  # (rows, ny)
+    half: Array  # (rows, ny)
+    seen: NDArray[np.bool_]
+    target: int
+
+    @property
+    def rows(self) -> int:
+        return len(self.A)
+
+
+class Design(NamedTuple):
+    """Gains of one window and what they make of the errors; see the module.
+
+    D0 (nx, nx) belongs to the belief before the window, D (nx, rows nx) to its inputs, L (nx, outputs seen) to its
+    outputs; P (nx, nx) and half (nx,) are covariance and half-widths of the error, that belief's part left out.
+    """
+
+    D0: Array
+    D: Array
+    L: Array
+    P: Array
+    half: Array
+
+
+def _window(rows: MixedRows, motion: Array, output: Array, a: int, e: int, target: int) -> _Window:
+    m, o = motion[a : e + 1], output[a : e + 1]
+    return _Window(
+        rows.A[0][m], rows.Q[0][m], rows.G[0][m], rows.C[0][o], rows.r[0][o, 0], rows.half[0][o, 0],
+        rows.seen[a : e + 1], target,
+    )  # fmt: skip
+
+
+def design(window: _Window, before: MixedBelief, kappa: float) -> Design | None:
+    """Return the best gains of one window, or None if no program was solved.
+
+    Parameters
+    ----------
+    window : the rows, laid out by `mixed_rows`
+    before : MixedBelief
+        What is known one step before the first: P and X, or P and the generators Z where there are any.
+    kappa : float
+    """
+    N, n, ng = window.rows, window.A.shape[1], window.G.shape[2]
+    rows, outputs = np.nonzero(window.seen)
+    C, r, half = window.C[rows, outputs], window.r[rows, outputs], window.half[rows, outputs]
+    p = len(rows)
+    roots = np.array([_root(S) for S in (before.P, *window.Q)])  # (N + 1, n, n)
+    X = np.zeros((n, n)) if len(before.Z) else _root(before.X)
+    boxes = [before.Z.T, *window.G]  # (n, .) each
+    # In units of the states' and outputs' own sizes, so that the solver sees numbers about 1.
+    size = np.sqrt(
+        kappa**2 * np.max(np.sum(roots**2, axis=2), axis=0) + np.sum(X**2, axis=1)
+        + np.max([np.sum(box**2, axis=1) for box in boxes], axis=0)
+    )  # fmt: skip
+    size = np.where(size > 0, size, size.max() if size.any() else 1.0)
+    weight = np.sqrt((C * size) ** 2 @ np.ones(n) + kappa**2 * r + half**2)
+    weight = np.where(weight > 0, weight, 1.0)
+    L = np.zeros((n, p))
+    if p:
+        problem = _Program(window.A, C / weight[:, None], rows, roots, X, boxes, np.sqrt(r) / weight, half / weight, size, kappa)
+        for i in range(n):
+            gains = problem.solve(window.target, i)
+            if gains is None:
+                return None
+            L[i] = size[i] * gains / weight
+    # From the gains to the coefficients of the error, exactly.
+    D = np.zeros((N + 1, n, n))
+    ahead = np.zeros((n, n))
+    for j in range(N - 1, -1, -1):
+        ahead = ahead @ window.A[j + 1] if j + 1 < N else np.zeros((n, n))
+        if j == window.target:
+            ahead = ahead + np.eye(n)
+        here = rows == j
+        ahead = ahead - L[:, here] @ C[here]
+        D[j + 1] = ahead
+    D[0] = D[1] @ window.A[0]
+    P = np.einsum("jab,jbc,jdc->ad", D[1:], window.Q, D[1:]) + (L * r) @ L.T
+    bias = np.abs(L) @ half + (np.abs(np.einsum("jab,jbc->jac", D[1:], window.G)).sum(axis=(0, 2)) if ng else 0.0)
+    return Design(D[0], np.concatenate(list(D[1:]), axis=1), L, P, bias)
+
+
+class _Program:
+    """The cone program of one window; only the target changes between its states.
+
+    Variables: the error's coefficients D_0 ... D_N (n each, in units of the states), the gains l, absolute values u, the
+    reach v of the ellipsoid and the standard deviation s. Constraints, in this order: the recursion of D as equations,
+    u >= |.|, the two cones.
+    """
+
+    def __init__(
+        self, A: Array, C: Array, rows: NDArray[np.int64], roots: Array, X: Array, boxes: list[Array], sd: Array,
+        half: Array, size: Array, kappa: float,
+    ) -> None:  # fmt: skip
+        from scipy import sparse
+
+        self.clarabel = _clarabel()
+        N, n, p = len(A), A.shape[1], len(rows)
+        put = _Entries()
+        d = np.arange((N + 1) * n).reshape(N + 1, n)  # columns of D
+        gain = (N + 1) * n + np.arange(p)
+        # D_j - A_{j+1}' D_{j+1} + [C_j' l_j] = [target] e_i, all scaled by the states' sizes: D~ = D diag(size)
+        put.diagonal(d.ravel(), d.ravel(), 1.0)
+        for j in range(N):
+            put.block(d[j], d[j + 1], -(A[j] * size / size[:, None]).T)
+        for j in range(N):
+            here = np.flatnonzero(rows == j)
+            put.block(d[j + 1], gain[here], (C[here] * size).T)
+        self.equations = row = (N + 1) * n
+        # absolute values
+        column = row + p
+        absolute = []
+        for j, box in enumerate(boxes):
+            for g in box.T[np.abs(box.T).sum(axis=1) > 0]:
+                absolute.append((d[j], g / size))
+        bounded = np.flatnonzero(half > 0)
+        self.absolutes = len(absolute) + len(bounded)
+        cost = np.concatenate([np.ones(len(absolute)), half[bounded]])
+        for sign in (1.0, -1.0):
+            for k, (columns, g) in enumerate(absolute):
+                put.block(np.array([row + k]), columns, sign * g[None])
+            at = row + len(absolute) + np.arange(len(bounded))
+            put.diagonal(at, gain[bounded], sign)
+            put.diagonal(row + np.arange(self.absolutes), column + np.arange(self.absolutes), -1.0)
+            row += self.absolutes
+        v, s = column + self.absolutes, column + self.absolutes + 1
+        # |X^{1/2}' D_0'| <= v
+        self.cones = []
+        put.diagonal(np.array([row]), np.array([v]), -1.0)
+        if X.any():
+            put.block(row + 1 + np.arange(n), d[0], -(X / size[:, None]).T)
+            self.cones.append(n + 1)
+        else:
+            self.cones.append(1)
+        row += self.cones[-1]
+        # |(roots' D', sd l)| <= s
+        put.diagonal(np.array([row]), np.array([s]), -1.0)
+        used = row + 1
+        for j in range(N + 1):
+            if roots[j].any():
+                put.block(used + np.arange(n), d[j], -(roots[j] / size[:, None]).T)
+                used += n
+        noisy = np.flatnonzero(sd > 0)
+        put.diagonal(used + np.arange(len(noisy)), gain[noisy], -sd[noisy])
+        used += len(noisy)
+        self.cones.append(used - row)
+        self.height, width = used, s + 1
+        self.A = put.matrix(self.height, width)
+        self.q = np.zeros(width)
+        self.q[column : column + self.absolutes] = cost
+        self.q[v], self.q[s] = 1.0, kappa
+        self.P = sparse.csc_matrix((width, width))
+        self.gain, self.n = gain, n
+
+    def solve(self, target: int, state: int) -> Array | None:
+        """Return the gains for one state of the target row, in its own units; None if the solver gives up."""
+        c = self.clarabel
+        b = np.zeros(self.height)
+        b[(target + 1) * self.n + state] = 1.0
+        cones = [c.ZeroConeT(self.equations), c.NonnegativeConeT(2 * self.absolutes)]
+        cones += [c.SecondOrderConeT(k) for k in self.cones]
+        settings = c.DefaultSettings()
+        settings.verbose = False
+        settings.max_iter = 100
+        found = c.DefaultSolver(self.P, self.q, self.A, b, cones, settings).solve()
+        gains = np.asarray(found.x, dtype=np.float64)[self.gain]
+        if str(found.status) not in ("Solved", "AlmostSolved") or not np.isfinite(gains).all():
+            return None
+        return gains
+
+
+class _Entries:
+    """Entries of a sparse matrix, collected block by block."""
+
+    def __init__(self) -> None:
+        self.i: list[Array] = []
+        self.j: list[Array] = []
+        self.v: list[Array] = []
+
+    def block(self, i: Any, j: Any, value: Array) -> None:
+        self.i.append(np.repeat(i, len(j)))
+        self.j.append(np.tile(j, len(i)))
+        self.v.append(value.ravel())
+
+    def diagonal(self, i: Any, j: Any, value: Any) -> None:
+        self.i.append(i)
+        self.j.append(j)
+        self.v.append(np.broadcast_to(value, len(i)))
+
+    def matrix(self, height: int, width: int) -> Any:
+        from scipy import sparse
+
+        v, i, j = (np.concatenate(part) for part in (self.v, self.i, self.j))
+        return sparse.csc_matrix((v, (i, j)), shape=(height, width))
+
+
+def _clarabel() -> Any:
+    try:
+        import clarabel
+    except ImportError:
+        raise Missing("`MixedWindow` needs the library clarabel", hint="pip install 'halfwidth[mixed]'") from None
+    return clarabel
+
+
+def _index(stack: Stack, T: int) -> NDArray[np.int64]:
+    return np.zeros(T, dtype=np.int64) if stack[1] is None else stack[1].astype(np.int64)
+
+
+def _root(S: Array) -> Array:
+    """Return a square root F of a positive semidefinite S = F F'."""
+    value, vector = np.linalg.eigh(S)
+    return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
+
+
+def _reach(D: Array, X: Array) -> Array:
+    """Return half-widths of D times ellipsoids, (k, nx)."""
+    return np.sqrt(np.maximum(np.einsum("ia,kab,ib->ki", D, X, D), 0.0))
+
+
+def _grid(S: Array) -> NDArray[np.int64]:
+    """Return matrices (T, n, n) on a grid, (T, n + n n): sizes by steps of a fifth, correlations by eighths."""
+    size = np.sqrt(np.maximum(np.diagonal(S, axis1=1, axis2=2), 0.0))
+    some = size > 0
+    steps = np.where(some, np.round(4 * np.log2(np.where(some, size, 1.0))), _NONE / 2)
+    unit = np.where(some, size, 1.0)
+    correlation = np.round(8 * S / unit[:, :, None] / unit[:, None, :])
+    return np.concatenate([steps, correlation.reshape(len(S), -1)], axis=1).astype(np.int64)
+
+
+def _halves(both: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    return [both[: len(both) // 2], both[len(both) // 2 :]]
+
+
+def _of_grid(grid: NDArray[np.int64]) -> Array:
+    """Return the matrix of a point of the grid, made positive semidefinite."""
+    n = int((np.sqrt(1 + 4 * len(grid)) - 1) / 2)
+    size = np.where(grid[:n] > _NONE // 4, 2.0 ** (grid[:n].clip(-4000, 4000) / 4), 0.0)
+    root = _root(grid[n:].reshape(n, n) / 8.0)
+    return np.asarray(size[:, None] * (root @ root.T) * size)
+
+
+__all__ = ["Design", "MixedWindow", "design"]
