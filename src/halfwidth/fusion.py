@@ -322,7 +322,8 @@ def fuse_sums(
         Their standard deviation in units of B / (2 L + 1); the best in the mean square if absent, about 0.8 for L = 3 and
         0.9 for L = 10.
     terms : int, optional
-        Keep this many, the heaviest; all if absent.
+        Keep this many, the heaviest, as the paper does; all if absent. The light terms are the tails, so dropping them
+        loses variance (a fifth of it at 40 terms); `fuse`, which keeps mean and variance alone, does not.
     """
     if not isinstance(L, int | np.integer) or L < 0:
         raise BadValue(f"`L` is {L!r}, a whole number from 0 was expected")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.cases import PAIRS, point_only, stochastic
+from tests.cases import PAIRS, point_only, stochastic, weighs
 
 import halfwidth as hw
 
@@ -11,6 +11,7 @@ SPREAD = [
     for m, c in PAIRS
     if isinstance(c.model, hw.Linear)
     and not stochastic(m)
+    and not weighs(m)
     and not point_only(m)
     and c.model.w.known
     and c.model.e.known

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadValue, Refused, hinted
-from halfwidth.methods._mixed_rows import MixedRows, mixed_rows, refuses
+from halfwidth.methods._mixed_rows import MixedRows, mixed_rows, parts, refuses
 from halfwidth.methods._protocol import pushed_row, typed
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record

@@ -137,7 +137,10 @@ class MixedWindow:
         kind = motion * (int(output.max()) + 1) + output
         inside = first[:, None] + np.arange(self.memory)
         kinds = np.where(inside <= end[:, None], kind[np.minimum(inside, T - 1)], -1)
-        rounded = np.concatenate([_grid(S) for S in filtered[1:3]], axis=1)
+        # sizes are rounded in units of those after the first row, so that the user's units do not matter
+        unit = np.sqrt(np.maximum(np.diagonal(self.kappa**2 * filtered.P[0] + filtered.X[0]), 0.0))
+        unit = np.where(unit > 0, unit, 1.0)
+        rounded = np.concatenate([_grid(S, unit) for S in filtered[1:3]], axis=1)
         arrival = np.where(first[:, None] > 0, rounded[np.maximum(first - 1, 0)], _NONE)
         keys = np.column_stack([np.arange(T) - first, kinds, arrival])
         _, one, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -145,7 +148,7 @@ class MixedWindow:
         for at in np.split(order, np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1):
             t = int(one[which.reshape(-1)[at[0]]])
             a, e = int(first[t]), int(end[t])
-            belief = start if a == 0 else MixedBelief(start.m, *(_of_grid(g) for g in _halves(rounded[a - 1])), start.Z)
+            belief = start if a == 0 else MixedBelief(start.m, *(_of_grid(g, unit) for g in _halves(rounded[a - 1])), start.Z)
             yield at, _window(rows, motion, output, a, e, t - a), belief
 
 
@@ -254,7 +257,7 @@ class _Program:
     ) -> None:  # fmt: skip
         from scipy import sparse
 
-        self.clarabel = _clarabel()
+        c = _clarabel()
         N, n, p = len(A), A.shape[1], len(rows)
         put = _Entries()
         d = np.arange((N + 1) * n).reshape(N + 1, n)  # columns of D
@@ -266,7 +269,7 @@ class _Program:
         for j in range(N):
             here = np.flatnonzero(rows == j)
             put.block(d[j + 1], gain[here], (C[here] * size).T)
-        self.equations = row = (N + 1) * n
+        row = (N + 1) * n
         # absolute values
         column = row + p
         absolute = []
@@ -274,25 +277,23 @@ class _Program:
             for g in box.T[np.abs(box.T).sum(axis=1) > 0]:
                 absolute.append((d[j], g / size))
         bounded = np.flatnonzero(half > 0)
-        self.absolutes = len(absolute) + len(bounded)
+        absolutes = len(absolute) + len(bounded)
         cost = np.concatenate([np.ones(len(absolute)), half[bounded]])
         for sign in (1.0, -1.0):
             for k, (columns, g) in enumerate(absolute):
                 put.block(np.array([row + k]), columns, sign * g[None])
             at = row + len(absolute) + np.arange(len(bounded))
             put.diagonal(at, gain[bounded], sign)
-            put.diagonal(row + np.arange(self.absolutes), column + np.arange(self.absolutes), -1.0)
-            row += self.absolutes
-        v, s = column + self.absolutes, column + self.absolutes + 1
+            put.diagonal(row + np.arange(absolutes), column + np.arange(absolutes), -1.0)
+            row += absolutes
+        v, s = column + absolutes, column + absolutes + 1
         # |X^{1/2}' D_0'| <= v
-        self.cones = []
+        cones = [c.ZeroConeT(row - 2 * absolutes), c.NonnegativeConeT(2 * absolutes)]
         put.diagonal(np.array([row]), np.array([v]), -1.0)
         if X.any():
             put.block(row + 1 + np.arange(n), d[0], -(X / size[:, None]).T)
-            self.cones.append(n + 1)
-        else:
-            self.cones.append(1)
-        row += self.cones[-1]
+        cones.append(c.SecondOrderConeT(n + 1 if X.any() else 1))
+        row += n + 1 if X.any() else 1
         # |(roots' D', sd l)| <= s
         put.diagonal(np.array([row]), np.array([s]), -1.0)
         used = row + 1
@@ -303,26 +304,23 @@ class _Program:
         noisy = np.flatnonzero(sd > 0)
         put.diagonal(used + np.arange(len(noisy)), gain[noisy], -sd[noisy])
         used += len(noisy)
-        self.cones.append(used - row)
-        self.height, width = used, s + 1
-        self.A = put.matrix(self.height, width)
-        self.q = np.zeros(width)
-        self.q[column : column + self.absolutes] = cost
-        self.q[v], self.q[s] = 1.0, kappa
-        self.P = sparse.csc_matrix((width, width))
-        self.gain, self.n = gain, n
+        cones.append(c.SecondOrderConeT(used - row))
+        q = np.zeros(s + 1)
+        q[column : column + absolutes] = cost
+        q[v], q[s] = 1.0, kappa
+        settings = c.DefaultSettings()
+        settings.verbose, settings.max_iter, settings.presolve_enable = False, 100, False
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
+        self.b, self.gain, self.n = np.zeros(used), gain, n
+        quadratic = sparse.csc_matrix((s + 1, s + 1))
+        self.solver = c.DefaultSolver(quadratic, q, put.matrix(used, s + 1), self.b, cones, settings)
 
     def solve(self, target: int, state: int) -> Array | None:
         """Return the gains for one state of the target row, in its own units; None if the solver gives up."""
-        c = self.clarabel
-        b = np.zeros(self.height)
-        b[(target + 1) * self.n + state] = 1.0
-        cones = [c.ZeroConeT(self.equations), c.NonnegativeConeT(2 * self.absolutes)]
-        cones += [c.SecondOrderConeT(k) for k in self.cones]
-        settings = c.DefaultSettings()
-        settings.verbose = False
-        settings.max_iter = 100
-        found = c.DefaultSolver(self.P, self.q, self.A, b, cones, settings).solve()
+        self.b[:] = 0.0
+        self.b[(target + 1) * self.n + state] = 1.0
+        self.solver.update(b=self.b)
+        found = self.solver.solve()
         gains = np.asarray(found.x, dtype=np.float64)[self.gain]
         if str(found.status) not in ("Solved", "AlmostSolved") or not np.isfinite(gains).all():
             return None
@@ -377,13 +375,13 @@ def _reach(D: Array, X: Array) -> Array:
     return np.sqrt(np.maximum(np.einsum("ia,kab,ib->ki", D, X, D), 0.0))
 
 
-def _grid(S: Array) -> NDArray[np.int64]:
+def _grid(S: Array, unit: Array) -> NDArray[np.int64]:
     """Return matrices (T, n, n) on a grid, (T, n + n n): sizes by steps of a fifth, correlations by eighths."""
     size = np.sqrt(np.maximum(np.diagonal(S, axis1=1, axis2=2), 0.0))
     some = size > 0
-    steps = np.where(some, np.round(4 * np.log2(np.where(some, size, 1.0))), _NONE / 2)
-    unit = np.where(some, size, 1.0)
-    correlation = np.round(8 * S / unit[:, :, None] / unit[:, None, :])
+    size = np.where(some, size, unit)
+    steps = np.where(some, np.round(4 * np.log2(size / unit)), _NONE / 2)
+    correlation = np.round(8 * S / size[:, :, None] / size[:, None, :])
     return np.concatenate([steps, correlation.reshape(len(S), -1)], axis=1).astype(np.int64)
 
 
@@ -391,10 +389,10 @@ def _halves(both: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return [both[: len(both) // 2], both[len(both) // 2 :]]
 
 
-def _of_grid(grid: NDArray[np.int64]) -> Array:
+def _of_grid(grid: NDArray[np.int64], unit: Array) -> Array:
     """Return the matrix of a point of the grid, made positive semidefinite."""
     n = int((np.sqrt(1 + 4 * len(grid)) - 1) / 2)
-    size = np.where(grid[:n] > _NONE // 4, 2.0 ** (grid[:n].clip(-4000, 4000) / 4), 0.0)
+    size = np.where(grid[:n] > _NONE // 4, unit * 2.0 ** (grid[:n].clip(-2000, 2000) / 4), 0.0)
     root = _root(grid[n:].reshape(n, n) / 8.0)
     return np.asarray(size[:, None] * (root @ root.T) * size)
 
