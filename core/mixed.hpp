@@ -22,7 +22,8 @@ namespace HW_ISA {
 
 constexpr double mixed_least = 1e-9;   // a stays this far from 0 and 1: the set grows by as much at most
 constexpr double mixed_far = 38.0;     // standard deviations beyond which a density is 0 in floating point
-constexpr int mixed_halvings = 32;     // of the odds a / (1 - a), from 1e-9 to 1e9: 1e-8 relative
+constexpr int mixed_halvings = 6;      // of the odds a / (1 - a), from 1e-9 to 1e9, before the slope is followed
+constexpr int mixed_steps = 40;
 constexpr int mixed_nodes = 33;        // first look where there may be several minima
 constexpr int mixed_golden = 40;
 
@@ -112,18 +113,30 @@ struct MixedRow {
     }
 };
 
-// The a that minimises the convex criterion, by halving the odds.
+// The a that minimises the convex criterion: the root of its slope in the odds a / (1 - a), first halved, then by regula
+// falsi with the Illinois rule.
 template <class N>
 double mixed_convex(const MixedRow<N>& row) {
-    double lo = mixed_least, hi = 1.0 / mixed_least;
-    if (row.slope(1.0 + 1.0 / lo, 1.0 + lo) >= 0.0) return lo;
-    if (row.slope(1.0 + 1.0 / hi, 1.0 + hi) <= 0.0) return 1.0 - lo;
-    for (int k = 0; k < mixed_halvings; k++) {
-        const double odds = std::sqrt(lo * hi);
-        if (row.slope(1.0 + 1.0 / odds, 1.0 + odds) < 0.0) lo = odds;
-        else hi = odds;
+    double lo = mixed_least, hi = 1.0 / mixed_least, odds = lo;
+    double at_lo = row.slope(1.0 + 1.0 / lo, 1.0 + lo), at_hi = row.slope(1.0 + 1.0 / hi, 1.0 + hi);
+    if (at_lo >= 0.0) return lo;
+    if (at_hi <= 0.0) return 1.0 - lo;
+    for (int k = 0; k < mixed_steps; k++) {
+        const double before = odds, middle = std::sqrt(lo * hi);
+        odds = (lo * at_hi - hi * at_lo) / (at_hi - at_lo);
+        if (k < mixed_halvings || !(odds > lo && odds < hi)) odds = middle;
+        const double at = row.slope(1.0 + 1.0 / odds, 1.0 + odds);
+        if (at < 0.0) {
+            if (before <= lo) at_hi *= 0.5;
+            lo = odds;
+            at_lo = at;
+        } else {
+            if (before >= hi) at_lo *= 0.5;
+            hi = odds;
+            at_hi = at;
+        }
+        if (std::fabs(odds - before) <= 1e-9 * odds) break;
     }
-    const double odds = std::sqrt(lo * hi);
     return odds / (1.0 + odds);
 }
 
@@ -289,7 +302,7 @@ void mixed_predict(N n, MixedArgs& a, const MixedBuffers& b, long t) {
     }
     if (zonotope) {
         for (int j = 0; j < a.count; j++) {
-            mul_v(n, n, A, a.Z + j * n, b.row);
+            mul_tv(n, n, b.Ft, a.Z + j * n, b.row);
             copy(n, b.row, a.Z + j * n);
         }
         for (int j = 0; j < a.ng; j++) {

@@ -109,8 +109,17 @@ def mixed_rows(model: Linear, record: Record) -> MixedRows:
 
 
 def _kinds(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    found, index = np.unique(keys, axis=0, return_inverse=True)
-    return found, index.reshape(-1)
+    """Return the distinct rows of an array of small numbers, and which of them each row is."""
+    code, room = np.zeros(len(keys), dtype=np.int64), 1
+    for column in keys.T:
+        base = int(column.max(initial=0)) + 1
+        if base > 1:
+            code, room = code * base + column, room * base
+        if room > 2**62:  # too many combinations to number: the rows themselves are compared
+            found, index = np.unique(keys, axis=0, return_inverse=True)
+            return found, index.reshape(-1)
+    _, first, index = np.unique(code, return_index=True, return_inverse=True)
+    return keys[first], index.reshape(-1)
 
 
 def _symmetric(Q: Array) -> Array:

@@ -145,7 +145,9 @@ class MixedFilter:
 
     def rows(self, rows: MixedRows, at: MixedBelief) -> dict[str, Any]:
         """Run the kernel over rows laid out by `mixed_rows`, from a belief one step before the first."""
-        capacity = max(int(self.generators), at.m.size)
+        # a lag's own axes come on top, or boxing would have the whole past to spend
+        nx = at.m.size // (int(self.lag) + 1)
+        capacity = max(int(self.generators) + nx * int(self.lag), at.m.size)
         found: dict[str, Any] = _core.mixed_run(
             *rows[:9], *at, _FORMS.index(self.form) if self.form != "combined" else 2, _CRITERIA.index(self.criterion),
             self.gain == "set", self.truncate, self.shrink, capacity, float(self.kappa),

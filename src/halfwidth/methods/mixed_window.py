@@ -16,6 +16,9 @@ References
 .. [1] Donoho (1994), Statistical estimation and optimal recovery, Ann. Statist. 22(1).
 """
 
+import contextlib
+import hashlib
+from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -194,7 +197,33 @@ def _window(rows: MixedRows, motion: Array, output: Array, a: int, e: int, targe
     )  # fmt: skip
 
 
+#: Designs that are held for other records of the same model, least recently used away first.
+_HELD = 4096
+_held: OrderedDict[bytes, Design | None] = OrderedDict()
+
+
 def design(window: _Window, before: MixedBelief, kappa: float) -> Design | None:
+    """Return the best gains of one window, held from an earlier call if they were found before.
+
+    A design depends on nothing but its arguments, so whether it was held makes no difference but to the time.
+    """
+    mark = hashlib.blake2b(np.array([kappa, window.target, *window.A.shape, *window.C.shape, *window.G.shape, len(before.Z)]).tobytes())
+    for part in (*window[:-1], *before[1:]):
+        mark.update(part.tobytes())
+    key = mark.digest()
+    if key in _held:
+        with contextlib.suppress(KeyError):  # another thread may have dropped it meanwhile
+            _held.move_to_end(key)
+            return _held[key]
+    found = optimal(window, before, kappa)
+    _held[key] = found
+    while len(_held) > _HELD:
+        with contextlib.suppress(KeyError):
+            _held.popitem(last=False)
+    return found
+
+
+def optimal(window: _Window, before: MixedBelief, kappa: float) -> Design | None:
     """Return the best gains of one window, or None if no program was solved.
 
     Parameters
@@ -397,4 +426,4 @@ def _of_grid(grid: NDArray[np.int64], unit: Array) -> Array:
     return np.asarray(size[:, None] * (root @ root.T) * size)
 
 
-__all__ = ["Design", "MixedWindow", "design"]
+__all__ = ["Design", "MixedWindow", "design", "optimal"]
