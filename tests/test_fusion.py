@@ -192,35 +192,6 @@ def test_extreme_numbers_stay_finite():
             assert found.S >= 0
 
 
-def test_example_one_of_the_paper():
-    """One source sampled again and again: E = 1, sigma = 3, z = 12, e = -1/2."""
-    rng = np.random.default_rng(1)
-    y = 12 - 0.5 + 3 * rng.standard_normal((1000, 6))
-    found = fusion.recursion(y, 1.0, 9.0)
-    np.testing.assert_allclose(np.sqrt(found.E), 1.0, atol=1e-9)
-    k = np.arange(1, 1001)
-    np.testing.assert_allclose(np.sqrt(found.S[-1]) * np.sqrt(1000) / 3, 1.0, atol=0.01)
-    lo, hi = found.interval()
-    wider = 9 / np.sqrt(1000)
-    assert np.abs(lo[-1] - (10.5 - wider)).max() < 0.3
-    assert np.abs(hi[-1] - (12.5 + wider)).max() < 0.3
-    assert np.mean((lo <= 12) & (hi >= 12)) >= 0.99
-    assert np.all(np.sqrt(found.S[9:]) <= 3.03 / np.sqrt(k[9:])[:, None])
-
-
-def test_example_two_of_the_paper():
-    """Sources that differ: e = sqrt(E_k) R_1, E_k = .25 + .75 R_2, sigma_k = sqrt(1 + 8 R_3)."""
-    rng = np.random.default_rng(2)
-    R = rng.random((3, 1000, 6))
-    E, S = 0.25 + 0.75 * R[1], 1 + 8 * R[2]
-    y = 12 + np.sqrt(E) * R[0] + np.sqrt(S) * rng.standard_normal(S.shape)
-    found = fusion.recursion(y, E, S)
-    half = np.sqrt(found.E[-1])
-    assert np.all((half >= 0.5) & (half <= 0.65))
-    lo, hi = found.interval()
-    assert np.mean((lo <= 12) & (hi >= 12)) >= 0.99
-
-
 def test_bad_input_is_named():
     with pytest.raises(BadValue, match="`E`"):
         Source(0.0, -1.0, 1.0)

@@ -109,11 +109,11 @@ def weights(E_x: ArrayLike, E_y: ArrayLike, lam: ArrayLike) -> Weights:
     lam : array_like
         From -1/2 (all x) to 1/2 (all y).
     """
-    return _combined(*np.broadcast_arrays(_lambda(lam), real(E_x, "E_x"), real(E_y, "E_y")))
+    return _combined(_lambda(lam), real(E_x, "E_x"), real(E_y, "E_y"))
 
 
 def _combined(lam: Array, Ex: Array, Ey: Array) -> Weights:
-    a, b = 0.5 - lam, 0.5 + lam
+    a, b, Ex, Ey = np.broadcast_arrays(0.5 - lam, 0.5 + lam, Ex, Ey)
     # scaled, so that no product leaves the range of floating point
     top = np.maximum(Ex, Ey)
     ex, ey = (np.divide(E, top, out=np.zeros(top.shape), where=top > 0) for E in (Ex, Ey))
