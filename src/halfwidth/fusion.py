@@ -1,11 +1,11 @@
 """Fusion of two sources whose errors are partly bounded and partly Gaussian: the scalar estimator in full.
 
-``x = z + e_x + c_x`` with ``e_x^2 <= E_x``, ``c_x ~ N(0, S_x)``, and y likewise (Hanebeck, Horn and Schmidt [1]_, eq. (1)).
-Of the bounded errors nothing else is known, so their sets are fused by a convex combination with a scalar lambda; the
+``x = z + e_x + c_x`` with ``e_x^2 <= E_x``, ``c_x ~ N(0, S_x)``, and y likewise (Hanebeck, Horn and Schmidt [1]_, eq.
+(1)). Of the bounded errors nothing else is known, so their sets are fused by a convex combination with a scalar lambda; the
 midpoint ``w_x x + w_y y`` of the fused set is uncertain through the Gaussian errors, given that the two sets meet. Its
-density is known exactly (`density`), as a sum of Gaussians (`fuse_sums`), and by its mean and variance (`fuse`), which is
-what the recursive estimator uses. Where a source has no set the estimator is the Kalman filter; where it has no Gaussian
-error it is the set estimator. `halfwidth.MixedFilter` is the form for vectors and motion.
+density is known exactly (`density`), as a sum of Gaussians (`fuse_sums`), and by its mean and variance (`fuse`), which
+is what the recursive estimator uses. Where a source has no set the estimator is the Kalman filter; where it has no
+Gaussian error it is the set estimator. `halfwidth.MixedFilter` is the form for vectors and motion.
 
 The paper's ``erf`` is the normal distribution function minus 1/2, its eq. (20). Formulas that its print has lost are
 derived anew; they agree with those that stand, to rounding.
@@ -161,8 +161,8 @@ def fuse(
     lam : array_like, optional
         From -1/2 (all x) to 1/2 (all y); chosen by the measure if absent.
     measure : {"width", "square", "set", "variance"} or function (E, S) -> values
-        Of eq. (32) is "width", ``sqrt(E) + kappa sqrt(S)``. The measure may have several minima and its least value at an
-        end, so 21 values of lambda with both ends are compared before the best is refined between its neighbours.
+        Of eq. (32) is "width", ``sqrt(E) + kappa sqrt(S)``. The measure may have several minima and its least value at
+        an end, so 21 values of lambda with both ends are compared before the best is refined between its neighbours.
     kappa : float
 
     Returns
@@ -206,7 +206,13 @@ def fuse(
 
 
 def recursion(
-    y: ArrayLike, E: ArrayLike, S: ArrayLike, *, lam: float | None = None, measure: Measure = "width", kappa: float = 3.0
+    y: ArrayLike,
+    E: ArrayLike,
+    S: ArrayLike,
+    *,
+    lam: float | None = None,
+    measure: Measure = "width",
+    kappa: float = 3.0,
 ) -> Fused:
     """Fuse measurements of one constant, one after the other: the recursive estimator, eqs. (39) to (43).
 
@@ -256,10 +262,7 @@ def density(x: Source, y: Source, lam: float, z: ArrayLike) -> Array:
     md, mu, B = float(x.m - y.m), float(wx * x.m + wy * y.m), float(np.sqrt(x.E) + np.sqrt(y.E))
     t = np.sqrt((wx + wy) ** 2 * Sx * Sy / s2)  # sd of x - y given the midpoint
     m = md + c / s2 * (z - mu)
-    if t > 0:
-        meets = _log_between(log_ndtr, (-B - m) / t, (B - m) / t)
-    else:
-        meets = np.where(np.abs(m) <= B, 0.0, -np.inf)
+    meets = _log_between(log_ndtr, (-B - m) / t, (B - m) / t) if t > 0 else np.where(np.abs(m) <= B, 0.0, -np.inf)
     ever = _log_between(log_ndtr, np.array((-B - md) / np.sqrt(S)), np.array((B - md) / np.sqrt(S)))
     return np.asarray(np.exp(-0.5 * (z - mu) ** 2 / s2 - 0.5 * np.log(2 * np.pi * s2) + meets - ever))
 
@@ -319,8 +322,8 @@ def fuse_sums(
     L : int
         The rectangle of the constraint becomes 2 L + 1 Gaussians at the spacing 2 B / (2 L + 1).
     c : float, optional
-        Their standard deviation in units of B / (2 L + 1); the best in the mean square if absent, about 0.8 for L = 3 and
-        0.9 for L = 10.
+        Their standard deviation in units of B / (2 L + 1); the best in the mean square if absent, about 0.8 for L = 3
+        and 0.9 for L = 10.
     terms : int, optional
         Keep this many, the heaviest, as the paper does; all if absent. The light terms are the tails, so dropping them
         loses variance (a fifth of it at 40 terms); `fuse`, which keeps mean and variance alone, does not.
@@ -331,8 +334,7 @@ def fuse_sums(
         raise BadValue(f"`terms` is {terms!r}, a positive whole number was expected")
     prior = x if isinstance(x, GaussianSum) else GaussianSum.of(x)
     S_x, S_y, m_y = prior.S, float(y.S), float(y.m)
-    wx, wy, E = _pair_weights(_Pair(Source(prior.mean, prior.E, S_x), y), _lambda(lam))
-    wx, wy = float(wx), float(wy)
+    wx, wy, E = (float(v) for v in _pair_weights(_Pair(Source(prior.mean, prior.E, S_x), y), _lambda(lam)))
     B = float(np.sqrt(prior.E) + np.sqrt(y.E))
     i = np.arange(-L, L + 1)
     m_g, S_g = 2 * B * i / (2 * L + 1), ((best_spread(L) if c is None else c) * B / (2 * L + 1)) ** 2
@@ -340,16 +342,16 @@ def fuse_sums(
     mu, md = wx * prior.m + wy * m_y, prior.m - m_y
     s2, cov = wx**2 * S_x + wy**2 * S_y, wx * S_x - wy * S_y
     if S <= 0:  # nothing is uncertain: the sets meet or not
-        return GaussianSum(prior.weight, mu, 0.0, float(E))
+        return GaussianSum(prior.weight, mu, 0.0, E)
     off = md[:, None] - m_g  # (terms, 2L + 1)
     log_w = np.log(np.maximum(prior.weight, 1e-300))[:, None] - 0.5 * off**2 / S
     w = np.exp(log_w - log_w.max()).ravel()
     z = (mu[:, None] - cov * off / S).ravel()
-    variance = max(s2 - cov**2 / S, 0.0)  # == [S_g (wx^2 Sx + wy^2 Sy) + (wx + wy)^2 Sx Sy] / S
+    variance = max(float(s2 - cov**2 / S), 0.0)  # == [S_g (wx^2 Sx + wy^2 Sy) + (wx + wy)^2 Sx Sy] / S
     if terms is not None and len(w) > terms:
         kept = np.sort(np.argpartition(w, -terms)[-terms:])
         w, z = w[kept], z[kept]
-    return GaussianSum(w / w.sum(), z, float(variance), float(E))
+    return GaussianSum(w / w.sum(), z, variance, E)
 
 
 def best_spread(L: int) -> float:
@@ -403,8 +405,8 @@ def _pair_weights(pair: _Pair, lam: Array) -> Weights:
 def _moments(pair: _Pair, lam: Array) -> tuple[Array, Array, Array]:
     """Mean, squared half-width and variance of the midpoint given that the sets meet, eqs. (28) to (31).
 
-    The midpoint is the Kalman estimate, which is free of the difference x - y, plus g times that difference; of eq. (30)
-    ``S_z = S_x S_y / S + g^2 Var(x - y)`` is left, a sum without cancellation.
+    The midpoint is the Kalman estimate, which is free of the difference x - y, plus g times that difference; of eq.
+    (30) ``S_z = S_x S_y / S + g^2 Var(x - y)`` is left, a sum without cancellation.
     """
     w = _pair_weights(pair, lam)
     g = pair.share - w.y

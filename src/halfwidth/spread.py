@@ -164,8 +164,8 @@ class Normal:
 class Both:
     """The state is a Gaussian centre plus something bounded: ``x = mean + N(0, P) + b``, ``|b_i| <= half_i``.
 
-    Of b nothing is known but the bound: it may be a bias that never averages out. An interval of level p therefore holds
-    the state with probability p at least, whatever b is.
+    Of b nothing is known but the bound: it may be a bias that never averages out. An interval of level p therefore
+    holds the state with probability p at least, whatever b is.
 
     Parameters
     ----------

@@ -42,16 +42,17 @@ def case(seed):
     return args | {"X": X, "Z": Z}, n + int(rng.integers(0, 5))
 
 
-def kernel(args, *, form, capacity=60, kappa=3.0, a=np.nan, criterion="trace", set_gain=False, truncate=False, shrink=False):
+def kernel(
+    args, *, form, capacity=60, kappa=3.0, a=np.nan, criterion="trace", set_gain=False, truncate=False, shrink=False
+):
     y = np.where(args["seen"], args["y"], 7e77)  # what stands in an unseen entry must not matter
     one = {k: (np.ascontiguousarray(args[k][None]), None) for k in ("A", "Q", "G", "C")}
     rows = {k: (args[k][None, None].copy(), None) for k in ("r", "half")}
-    out = _core.mixed_run(
+    return _core.mixed_run(
         one["A"], args["b"], one["Q"], one["G"], one["C"], rows["r"], rows["half"], y, args["seen"], args["m"], args["P"],
         args["X"], args["Z"], FORMS.index(form), ("trace", "width").index(criterion), set_gain, truncate, shrink,
         max(capacity, len(args["m"]), len(args["Z"])), kappa, a, 3.0,
     )  # fmt: skip
-    return out
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -83,7 +84,7 @@ def test_the_scalar_is_the_best(settings):
     for seed in range(60):
         args, _ = case(seed)
         args |= {"y": args["y"][:1], "seen": np.ones_like(args["seen"][:1]), "b": args["b"][:1]}
-        args |= {k: args[k][: 1] for k in ("C", "r", "half")} | {"y": args["y"][:, :1], "seen": args["seen"][:, :1]}
+        args |= {k: args[k][:1] for k in ("C", "r", "half")} | {"y": args["y"][:, :1], "seen": args["seen"][:, :1]}
         out = kernel(args, form="ellipsoid", **settings)
         a = out["a"][0, 0]
         if not 0.0 < a < 1.0:

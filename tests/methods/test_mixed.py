@@ -65,7 +65,9 @@ def test_without_sets_it_is_the_kalman_filter(case, form, kappa):
     variants = [{}] if form == "zonotope" else [{}, {"gain": "set"}, {"criterion": "width"}]
     for more in variants:
         for truncate in (False, True):
-            est = hw.estimate(case.model, case.record, hw.MixedFilter(form=form, kappa=kappa, truncate=truncate, **more))
+            est = hw.estimate(
+                case.model, case.record, hw.MixedFilter(form=form, kappa=kappa, truncate=truncate, **more)
+            )
             np.testing.assert_allclose(est.x, want.x, rtol=1e-10, atol=1e-10)
             np.testing.assert_allclose(est.spread.P, want.P, rtol=1e-10, atol=1e-10)
             np.testing.assert_array_equal(est.spread.half, 0.0)
@@ -98,7 +100,10 @@ def schweppe(rows, a_used, m, X):
         weight = 1 / (np.diag(moved) + (G**2).sum(axis=1))
         terms = [moved, *(np.outer(g, g) for g in G.T)]
         size = [np.sqrt(weight @ np.diag(term)) for term in terms]
-        m, X = A @ m + (0 if rows.b is None else rows.b[t]), sum(size) * sum(term / s for term, s in zip(terms, size, strict=True))
+        m, X = (
+            A @ m + (0 if rows.b is None else rows.b[t]),
+            sum(size) * sum(term / s for term, s in zip(terms, size, strict=True)),
+        )
         for i in range(len(y)):
             a = a_used[t, i]
             information = a * np.linalg.inv(X) + (1 - a) * np.outer(C[i], C[i]) / half[i] ** 2
@@ -153,7 +158,9 @@ def test_bounded_noise_never_leaves_the_set(method):
 
 def test_shrinking_makes_the_ellipsoids_smaller():
     model, truth, record = bounded(400)
-    plain, shrunk = (hw.estimate(model, record, hw.MixedFilter(form="ellipsoid", gain="set", shrink=s)) for s in (False, True))
+    plain, shrunk = (
+        hw.estimate(model, record, hw.MixedFilter(form="ellipsoid", gain="set", shrink=s)) for s in (False, True)
+    )
     assert shrunk.spread.half.mean() < 0.99 * plain.spread.half.mean()
     lo, hi = shrunk.interval()
     assert np.all((lo <= truth.x) & (truth.x <= hi))
@@ -226,7 +233,9 @@ def test_half_width_beside_the_affine_optimum(setting, optimum):
 
 def test_an_output_never_makes_the_weighted_sum_wider():
     """One state may widen, the sum of all relative to their predicted sizes does not."""
-    model = oscillator(hw.Uniform(0.1) + hw.Gaussian(0.02), hw.Uniform(0.3) + hw.Gaussian(0.1), hw.Normal(np.zeros(3), 1.0))
+    model = oscillator(
+        hw.Uniform(0.1) + hw.Gaussian(0.02), hw.Uniform(0.3) + hw.Gaussian(0.1), hw.Normal(np.zeros(3), 1.0)
+    )
     model = dataclasses.replace(model, C=[[1.0, 0.0, 0.3]], e=hw.Uniform(0.3) + hw.Gaussian(0.1), F=None, names=None)
     y = np.zeros(30)
     c = model.C.single[0]
@@ -303,7 +312,9 @@ def errors_of(window, before, L):
 
 @pytest.mark.parametrize("lag", [0, 3])
 def test_gains_of_the_window_are_optimal_and_its_errors_are_what_it_says(lag):
-    model = oscillator(hw.Uniform(0.1) + hw.Gaussian(0.02), hw.Uniform(0.3) + hw.Gaussian(0.1), hw.Normal(np.zeros(3), 1.0))
+    model = oscillator(
+        hw.Uniform(0.1) + hw.Gaussian(0.02), hw.Uniform(0.3) + hw.Gaussian(0.1), hw.Normal(np.zeros(3), 1.0)
+    )
     y = np.random.default_rng(0).standard_normal((30, 2))
     y[[3, 17, 20]] = np.nan
     y[8, 0] = np.nan
@@ -371,14 +382,18 @@ def test_any_covariance_of_the_outputs_is_made_diagonal():
         root = rng.standard_normal((ny, int(rng.integers(1, ny + 1))))
         F = np.eye(ny) + np.triu(rng.standard_normal((ny, ny)), 1)
         e = hw.Uniform(rng.random(ny)) + hw.Gaussian(root @ root.T)
-        model = hw.Linear(np.eye(2), None, rng.standard_normal((ny, 2)), hw.Gaussian(1.0), e, hw.Normal(np.zeros(2), 1.0), F=F)
+        model = hw.Linear(
+            np.eye(2), None, rng.standard_normal((ny, 2)), hw.Gaussian(1.0), e, hw.Normal(np.zeros(2), 1.0), F=F
+        )
         y = np.where(rng.random(ny) < 0.7, 1.0, np.nan)
         rows = mixed_rows(model, hw.Record([1.0], y[None]))
         M, seen = rows.M[0][0], ~np.isnan(y)
         fold = np.linalg.inv(F)
         S = M @ np.where(np.outer(seen, seen), fold @ (root @ root.T) @ fold.T, 0.0) @ M.T
         np.testing.assert_allclose(S, np.diag(rows.r[0][0, 0]), atol=1e-10 * max(np.abs(S).max(), 1.0))
-        np.testing.assert_allclose(rows.half[0][0, 0][seen], (np.abs(M[:, seen] @ fold[seen]) @ model.e.uniform.q)[seen])
+        np.testing.assert_allclose(
+            rows.half[0][0, 0][seen], (np.abs(M[:, seen] @ fold[seen]) @ model.e.uniform.q)[seen]
+        )
 
 
 def test_the_default_for_mixed_noise():

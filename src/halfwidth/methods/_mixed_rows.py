@@ -1,12 +1,12 @@
 """A linear model with bounded and Gaussian noise laid out row by row, outputs made independent of each other.
 
-With E and F folded in, ``x[t] = A x[t-1] + b + w + G d`` with w ~ N(0, Q) and ``|d_j| <= 1``. The outputs that were seen
-in a row, ``F^-1 (C x + e)``, are turned by a matrix M that makes the Gaussian part of their errors independent; what is
-bounded in a turned output is the sum of what it holds of each entry, taken as a bound of its own. Where all outputs are
-seen and the covariance of e is diagonal, M is F and nothing is lost by it.
+With E and F folded in, ``x[t] = A x[t-1] + b + w + G d`` with w ~ N(0, Q) and ``|d_j| <= 1``. The outputs that were
+seen in a row, ``F^-1 (C x + e)``, are turned by a matrix M that makes the Gaussian part of their errors independent;
+what is bounded in a turned output is the sum of what it holds of each entry, taken as a bound of its own. Where all
+outputs are seen and the covariance of e is diagonal, M is F and nothing is lost by it.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,7 +126,7 @@ def _symmetric(Q: Array) -> Array:
     return np.asarray(0.5 * (Q + Q.T))
 
 
-def _turned(C: Array, F: Array, R: Array, half: Array, seen: NDArray[np.bool_]) -> tuple[Array, ...]:
+def _turned(C: Array, F: Array, R: Array, half: Array, seen: NDArray[np.bool_]) -> tuple[Any, ...]:
     """Return rows of C, variances, half-widths, M (ny, ny) and which rows are used, for the outputs that were seen."""
     ny = len(half)
     s = np.flatnonzero(seen)

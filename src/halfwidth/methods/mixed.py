@@ -2,16 +2,17 @@
 
 A bias, the error of a map or a quantiser is not noise: it need not average out. Each state is therefore known as a
 Gaussian centre plus something bounded, ``x = m + N(0, P) + b`` with b in an ellipsoid or a zonotope, and each output is
-folded in by the gain that serves both parts best. This is the estimator of Hanebeck, Horn and Schmidt [1]_, whose scalar
-form is `halfwidth.fusion`, for vectors and with motion, with the gain of Noack and others [2]_ in place of the sets' own,
-and the zonotopes of Combastel [3]_. Without bounded noise it is the Kalman filter, without Gaussian noise the filter of
-bounding ellipsoids.
+folded in by the gain that serves both parts best. This is the estimator of Hanebeck, Horn and Schmidt [1]_, whose
+scalar form is `halfwidth.fusion`, for vectors and with motion, with the gain of Noack and others [2]_ in place of the
+sets' own, and the zonotopes of Combastel [3]_. Without bounded noise it is the Kalman filter, without Gaussian noise
+the filter of bounding ellipsoids.
 
 References
 ----------
 .. [1] Hanebeck, Horn and Schmidt, On combining statistical and set theoretic estimation.
-.. [2] Noack, Pfaff and Hanebeck (2012), Optimal Kalman gains for combined stochastic and set-membership state estimation.
-.. [3] Combastel (2015), Zonotopes and Kalman observers: gain optimality under distinct uncertainty paradigms.
+.. [2] Noack, Pfaff and Hanebeck (2012), Optimal Kalman gains for combined stochastic and set-membership state
+estimation. .. [3] Combastel (2015), Zonotopes and Kalman observers: gain optimality under distinct uncertainty
+paradigms.
 """
 
 import json
@@ -54,8 +55,8 @@ class MixedFilter:
     """Centre, covariance and set of each state given the outputs up to its row.
 
     The answer's spread is `Both`. Its interval holds the state with the level's probability whatever the bounded noises
-    do within their half-widths, as long as `truncate` and `shrink` are off; it is not guaranteed, since the Gaussian part
-    has no end. ``info["X"]`` (T, nx, nx) are the ellipsoids, ``info["a"]`` (T, ny) the scalar of each correction.
+    do within their half-widths, as long as `truncate` and `shrink` are off; it is not guaranteed, since the Gaussian
+    part has no end. ``info["X"]`` (T, nx, nx) are the ellipsoids, ``info["a"]`` (T, ny) the scalar of each correction.
 
     Parameters
     ----------
@@ -116,11 +117,13 @@ class MixedFilter:
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
                 raise BadValue(f"`{name}` is {value!r}, a whole number from {least} was expected")
         if self.shrink and (self.gain != "set" or self.form != "ellipsoid"):
-            raise BadValue('`shrink` is the overlap of two ellipsoids', hint='gain="set", form="ellipsoid"')
+            raise BadValue("`shrink` is the overlap of two ellipsoids", hint='gain="set", form="ellipsoid"')
         if self.form == "zonotope" and (self.a is not None or self.gain != "both"):
             raise BadValue("a zonotope has no scalar `a` and one gain", hint='form="combined"')
         if self.lag and self.form != "zonotope":
-            raise BadValue(f'`lag` is {self.lag} but `form` is "{self.form}"', hint='form="zonotope", or MixedWindow(lag=...)')
+            raise BadValue(
+                f'`lag` is {self.lag} but `form` is "{self.form}"', hint='form="zonotope", or MixedWindow(lag=...)'
+            )
 
     def refuses(self, model: Model) -> str | None:
         """Return why the model cannot be taken, or None."""
@@ -227,12 +230,12 @@ class _NewestMixed(Newest):
     __slots__ = ()
 
     @property
-    def spread(self) -> Spread:  # type: ignore[override]
+    def spread(self) -> Spread:
         """Gaussian centre and half-widths of the set."""
         return Both(self.x, self._belief.P[None], self._belief.half[None])
 
     @property
-    def loglik(self) -> None:  # type: ignore[override]
+    def loglik(self) -> None:
         """None: what is only bounded has no likelihood."""
         return None
 
@@ -253,7 +256,9 @@ class MixedStream:
     def __init__(self, method: MixedFilter, model: Linear, t: float) -> None:
         reason = method.refuses(model)
         if reason is None and any(m.stacked for m in _varying(model)):
-            reason = "a matrix is stacked row by row, a stream does not know which row comes next\nhint: a function of dt"
+            reason = (
+                "a matrix is stacked row by row, a stream does not know which row comes next\nhint: a function of dt"
+            )
         if reason is not None:
             message, hint = hinted(reason)
             raise Refused(message, hint=hint)
@@ -263,7 +268,9 @@ class MixedStream:
         self.belief = lagged_belief(prior(model), int(method.lag))
         self._laid: dict[bytes, MixedRows] = {}
         self._fixed = all(m.constant for m in _varying(model))
-        self._kind = type("NewestMixed", (_NewestMixed,), {"__slots__": (), "method": typed(method), "names": model.names.x})
+        self._kind = type(
+            "NewestMixed", (_NewestMixed,), {"__slots__": (), "method": typed(method), "names": model.names.x}
+        )
 
     def push(self, y: ArrayLike | None, u: ArrayLike | None = None, dt: float | None = None) -> Estimate:
         """Fold one row in and return the estimate of `lag` rows ago."""
@@ -287,7 +294,7 @@ class MixedStream:
         key = seen.tobytes()
         laid = self._laid.get(key) if self._fixed else None
         if laid is None:
-            one = Record([self.t + dt], y[None], None if u is None else u[None])
+            one = Record(np.array([self.t + dt]), y[None], None if u is None else u[None])
             laid = lagged(mixed_rows(replace(self.model, dt=dt), one), int(self.method.lag))
             if not self._fixed:
                 return laid

@@ -1,15 +1,16 @@
 """The optimal affine estimator for mixed noise, over a sliding window.
 
 Of all estimates that are affine in the outputs of a window, ``x = sum_j D_j b_j + D_0 m + L y``, the one is taken whose
-worst half-width is least: with the coefficients of the error, ``D_j = D_{j+1} A_{j+1} + [j is the target] I - L_j C_j``,
+worst half-width is least: with the coefficients of the error, ``D_j = D_{j+1} A_{j+1} + [j is the target] I - L_j
+C_j``,
 
     minimise  sum_j |D_j G_j| + |L| half + |X^{1/2} D_0'|  +  kappa |(P^{1/2} D_0', Q_j^{1/2} D_j', r^{1/2} L')|
 
 for each state, a second-order cone program [1]_. The first terms bound what the bounded noises can do, whatever they do,
 the last is the standard deviation. The program knows no data, so gains are found once for each pattern of seen outputs,
 and in a time-invariant model nearly all rows share a few. What is known before the window, (m, P, X), is the belief of
-`MixedFilter`; gains are found for P and X rounded to a grid, and half-widths then computed for those gains with the belief
-itself, so they hold exactly for what is reported.
+`MixedFilter`; gains are found for P and X rounded to a grid, and half-widths then computed for those gains with the
+belief itself, so they hold exactly for what is reported.
 
 References
 ----------
@@ -42,8 +43,8 @@ from halfwidth.spread import Both
 class MixedWindow:
     """Centre, covariance and set of each state by the optimal affine estimator over the newest rows.
 
-    Needs the library clarabel (``pip install 'halfwidth[mixed]'``). A design takes some milliseconds a state, so a record
-    in which every row has its own pattern of missing outputs takes as long as many designs; `MixedFilter` takes
+    Needs the library clarabel (``pip install 'halfwidth[mixed]'``). A design takes some milliseconds a state, so a
+    record in which every row has its own pattern of missing outputs takes as long as many designs; `MixedFilter` takes
     microseconds, at half-widths a few per cent larger.
 
     Parameters
@@ -91,7 +92,7 @@ class MixedWindow:
 
     def run(self, model: Linear, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
         """Estimate every row from the window about it."""
-        T, n = len(record), model.nx
+        n = model.nx
         rows, start = mixed_rows(model, record), prior(model)
         out = MixedFilter(form="ellipsoid", kappa=self.kappa).rows(rows, start)
         filtered = MixedBelief(out["m"], out["P"], out["X"], np.zeros((0, n)))
@@ -151,7 +152,11 @@ class MixedWindow:
         for at in np.split(order, np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1):
             t = int(one[which.reshape(-1)[at[0]]])
             a, e = int(first[t]), int(end[t])
-            belief = start if a == 0 else MixedBelief(start.m, *(_of_grid(g, unit) for g in _halves(rounded[a - 1])), start.Z)
+            belief = (
+                start
+                if a == 0
+                else MixedBelief(start.m, *(_of_grid(g, unit) for g in _halves(rounded[a - 1])), start.Z)
+            )
             yield at, _window(rows, motion, output, a, e, t - a), belief
 
 
@@ -189,7 +194,9 @@ class Design(NamedTuple):
     half: Array
 
 
-def _window(rows: MixedRows, motion: Array, output: Array, a: int, e: int, target: int) -> _Window:
+def _window(
+    rows: MixedRows, motion: NDArray[np.int64], output: NDArray[np.int64], a: int, e: int, target: int
+) -> _Window:
     m, o = motion[a : e + 1], output[a : e + 1]
     return _Window(
         rows.A[0][m], rows.Q[0][m], rows.G[0][m], rows.C[0][o], rows.r[0][o, 0], rows.half[0][o, 0],
@@ -207,7 +214,9 @@ def design(window: _Window, before: MixedBelief, kappa: float) -> Design | None:
 
     A design depends on nothing but its arguments, so whether it was held makes no difference but to the time.
     """
-    mark = hashlib.blake2b(np.array([kappa, window.target, *window.A.shape, *window.C.shape, *window.G.shape, len(before.Z)]).tobytes())
+    mark = hashlib.blake2b(
+        np.array([kappa, window.target, *window.A.shape, *window.C.shape, *window.G.shape, len(before.Z)]).tobytes()
+    )
     for part in (*window[:-1], *before[1:]):
         mark.update(part.tobytes())
     key = mark.digest()
@@ -250,7 +259,9 @@ def optimal(window: _Window, before: MixedBelief, kappa: float) -> Design | None
     weight = np.where(weight > 0, weight, 1.0)
     L = np.zeros((n, p))
     if p:
-        problem = _Program(window.A, C / weight[:, None], rows, roots, X, boxes, np.sqrt(r) / weight, half / weight, size, kappa)
+        problem = _Program(
+            window.A, C / weight[:, None], rows, roots, X, boxes, np.sqrt(r) / weight, half / weight, size, kappa
+        )
         for i in range(n):
             gains = problem.solve(window.target, i)
             if gains is None:
@@ -275,14 +286,14 @@ def optimal(window: _Window, before: MixedBelief, kappa: float) -> Design | None
 class _Program:
     """The cone program of one window; only the target changes between its states.
 
-    Variables: the error's coefficients D_0 ... D_N (n each, in units of the states), the gains l, absolute values u, the
-    reach v of the ellipsoid and the standard deviation s. Constraints, in this order: the recursion of D as equations,
-    u >= |.|, the two cones.
+    Variables: the error's coefficients D_0 ... D_N (n each, in units of the states), the gains l, absolute values u,
+    the reach v of the ellipsoid and the standard deviation s. Constraints, in this order: the recursion of D as
+    equations, u >= |.|, the two cones.
     """
 
     def __init__(
-        self, A: Array, C: Array, rows: NDArray[np.int64], roots: Array, X: Array, boxes: list[Array], sd: Array,
-        half: Array, size: Array, kappa: float,
+        self, A: Array, C: Array, sd: Array, half: Array, rows: NDArray[np.int64], roots: Array, X: Array,
+        boxes: list[Array], size: Array, kappa: float,
     ) -> None:  # fmt: skip
         from scipy import sparse
 
@@ -353,7 +364,7 @@ class _Program:
         gains = np.asarray(found.x, dtype=np.float64)[self.gain]
         if str(found.status) not in ("Solved", "AlmostSolved") or not np.isfinite(gains).all():
             return None
-        return gains
+        return np.asarray(gains)
 
 
 class _Entries:
@@ -412,10 +423,6 @@ def _grid(S: Array, unit: Array) -> NDArray[np.int64]:
     steps = np.where(some, np.round(4 * np.log2(size / unit)), _NONE / 2)
     correlation = np.round(8 * S / size[:, :, None] / size[:, None, :])
     return np.concatenate([steps, correlation.reshape(len(S), -1)], axis=1).astype(np.int64)
-
-
-def _halves(both: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    return [both[: len(both) // 2], both[len(both) // 2 :]]
 
 
 def _of_grid(grid: NDArray[np.int64], unit: Array) -> Array:

@@ -1,9 +1,9 @@
 """The two simulations of the estimator for mixed bounded and Gaussian noise, and what it stands on.
 
-A constant 12 is measured a thousand times, always with the same bounded error (figure 1), or with bounded errors and noise
-that differ from measurement to measurement (figure 2). The paper shows one run of each as a figure and states the limit of
-the first; here many runs stand beside it. The print has lost several formulas; `halfwidth.fusion` derives them anew, and the
-tables of borders and of the Gaussian sum check them.
+A constant 12 is measured a thousand times, always with the same bounded error (figure 1), or with bounded errors and
+noise that differ from measurement to measurement (figure 2). The paper shows one run of each as a figure and states the
+limit of the first; here many runs stand beside it. The print has lost several formulas; `halfwidth.fusion` derives them
+anew, and the tables of borders and of the Gaussian sum check them.
 
 References
 ----------
@@ -67,7 +67,7 @@ def example_one(*, quick: bool = False) -> Table:
     lo, hi = run.found.interval()
     inside = float(np.mean((lo <= Z) & (hi >= Z)))
     return Table(
-        f"Example 1, figure 1: the same source sampled (E = 1, sigma = 3, z = 12, e = -.5), mean of {run.y.shape[1]} runs",
+        f"Example 1, figure 1: the same source sampled (E = 1, sigma = 3, z = 12, e = -.5), {run.y.shape[1]} runs",
         ("k", "m", "sqrt E", "sigma", "3/sqrt k", "lower", "upper", "limit -+ 9/sqrt k", "inside"),
         tuple(rows),
         (
@@ -99,7 +99,7 @@ def example_two(*, quick: bool = False) -> Table:
 
 
 def choices(*, quick: bool = False) -> Table:
-    """What lambda is chosen by: the measures that the paper allows beside (32)."""
+    """Compare what lambda may be chosen by: the measures that the paper allows beside (32)."""
     rows = []
     for name, draw in (("same source", same_source), ("different sources", different_sources)):
         y = draw(1, 200 if quick else N).y
@@ -136,41 +136,47 @@ def sums(*, quick: bool = False) -> Table:
             off_m = max(off_m, abs(near.mean - float(exact.m)) / sd)
             off_s = max(off_s, abs(near.variance / float(exact.S) - 1))
         rows.append((f"{2 * L + 1} terms", round(fusion.best_spread(L), 3), worst, off_m, off_s))
-    every = few = exact = Source(0.3, 0.5, 1.0)
+    exact: Source = Source(0.3, 0.5, 1.0)
+    every = few = fusion.GaussianSum.of(exact)
     rng = np.random.default_rng(0)
     for _ in range(3):
         y = Source(rng.normal(0, 0.7), 0.4, 0.6)
         every, few = fusion.fuse_sums(every, y, 0.1, L=6), fusion.fuse_sums(few, y, 0.1, L=6, terms=40)
         exact = fuse(exact, y, 0.1)
     sd = np.sqrt(every.variance)
-    for name, m, S in (("mean and variance alone", float(exact.m), float(exact.S)), ("40 heaviest kept", few.mean, few.variance)):
+    for name, m, S in (
+        ("mean and variance alone", float(exact.m), float(exact.S)),
+        ("40 heaviest kept", few.mean, few.variance),
+    ):
         rows.append((f"3 steps, {name}", None, None, abs(m - every.mean) / sd, abs(S / every.variance - 1)))
     return Table(
         "Sections 4 and 5: the constraint as a sum of Gaussians against the exact density, worst of three cases",
         ("", "c", "total variation", "mean off / sd", "variance off"),
         tuple(rows),
         (
-            "The steps are compared with all 13^3 terms. Keeping the heaviest terms, as the paper proposes for a recursion,"
+            "The steps are compared with all 13^3 terms. Keeping the heaviest, as the paper proposes for a recursion,"
             " drops the tails and a fifth of the variance; its mean and variance alone stay within a thousandth.",
         ),
     )
 
 
 def borders(*, quick: bool = False) -> Table:  # noqa: ARG001
-    """The limits of section 6.2, largest difference over lambda."""
+    """Check the limits of section 6.2: largest difference over lambda."""
     lam = np.linspace(-0.5, 0.5, 21)
     x, y = (0.7, 0.5), (-1.1, 2.0)
-    rows = []
+    rows: list[tuple[object, ...]] = []
     for tiny in (0.0, 1e-28, 1e-20):
         found = fuse(Source(x[0], tiny, x[1]), Source(y[0], tiny, y[1]), lam)
         m, S = (y[1] * x[0] + x[1] * y[0]) / (x[1] + y[1]), 1 / (1 / x[1] + 1 / y[1])
-        rows.append((f"sets of half-width {np.sqrt(tiny):g}: Kalman filter", _most(found.m - m), _most(found.S - S), None))
+        rows.append(
+            (f"sets of half-width {np.sqrt(tiny):g}: Kalman filter", _most(found.m - m), _most(found.S - S), None)
+        )
     for tiny in (0.0, 1e-28, 1e-20):
         one, two = Source(0.7, 1.0, tiny), Source(-0.4, 0.5, tiny)
         found, w = fuse(one, two, lam), fusion.weights(one.E, two.E, lam)
         rows.append(
-            (f"noise of deviation {np.sqrt(tiny):g}: set estimator", _most(found.m - w.x * 0.7 + w.y * 0.4), _most(found.S),
-             _most(found.E - 1 / ((0.5 - lam) / 1.0 + (0.5 + lam) / 0.5)))
+            (f"noise of deviation {np.sqrt(tiny):g}: set estimator", _most(found.m - w.x * 0.7 + w.y * 0.4),
+             _most(found.S), _most(found.E - 1 / ((0.5 - lam) / 1.0 + (0.5 + lam) / 0.5)))
         )  # fmt: skip
     return Table("Section 6.2: border cases, eqs. (33) to (38)", ("limit", "m", "S", "E"), tuple(rows))
 
