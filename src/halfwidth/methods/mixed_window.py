@@ -1,12 +1,12 @@
 """The optimal affine estimator for mixed noise, over a sliding window.
 
 Of all estimates that are affine in the outputs of a window, ``x = sum_j D_j b_j + D_0 m + L y``, the one is taken whose
-worst half-width is least: with the coefficients of the error, ``D_j = D_{j+1} A_{j+1} + [j is the target] I - L_j
-C_j``,
+worst half-width is least. With the coefficients of its error, ``D_j = D_{j+1} A_{j+1} - L_j C_j``, plus the identity
+where j is the row asked for,
 
     minimise  sum_j |D_j G_j| + |L| half + |X^{1/2} D_0'|  +  kappa |(P^{1/2} D_0', Q_j^{1/2} D_j', r^{1/2} L')|
 
-for each state, a second-order cone program [1]_. The first terms bound what the bounded noises can do, whatever they do,
+for each state, a second-order cone program [1]_. The first terms bound what the bounded noises can do, whatever it is;
 the last is the standard deviation. The program knows no data, so gains are found once for each pattern of seen outputs,
 and in a time-invariant model nearly all rows share a few. What is known before the window, (m, P, X), is the belief of
 `MixedFilter`; gains are found for P and X rounded to a grid, and half-widths then computed for those gains with the
@@ -152,11 +152,10 @@ class MixedWindow:
         for at in np.split(order, np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1):
             t = int(one[which.reshape(-1)[at[0]]])
             a, e = int(first[t]), int(end[t])
-            belief = (
-                start
-                if a == 0
-                else MixedBelief(start.m, *(_of_grid(g, unit) for g in _halves(rounded[a - 1])), start.Z)
-            )
+            belief = start
+            if a > 0:
+                P, X = (_of_grid(part, unit) for part in np.split(rounded[a - 1], 2))
+                belief = MixedBelief(start.m, P, X, start.Z[:0])
             yield at, _window(rows, motion, output, a, e, t - a), belief
 
 
@@ -164,7 +163,7 @@ _NONE = np.iinfo(np.int64).min
 
 
 class _Window(NamedTuple):
-    """The matrices of a window's rows, (rows, ., .), the outputs seen in them (rows, ny), and which row is asked for."""
+    """The matrices of a window's rows, (rows, ., .), its outputs that are seen (rows, ny), and the row asked for."""
 
     A: Array
     Q: Array
@@ -260,8 +259,8 @@ def optimal(window: _Window, before: MixedBelief, kappa: float) -> Design | None
     L = np.zeros((n, p))
     if p:
         problem = _Program(
-            window.A, C / weight[:, None], rows, roots, X, boxes, np.sqrt(r) / weight, half / weight, size, kappa
-        )
+            window.A, C / weight[:, None], np.sqrt(r) / weight, half / weight, rows, roots, X, boxes, size, kappa
+        )  # fmt: skip
         for i in range(n):
             gains = problem.solve(window.target, i)
             if gains is None:
@@ -412,7 +411,7 @@ def _root(S: Array) -> Array:
 
 def _reach(D: Array, X: Array) -> Array:
     """Return half-widths of D times ellipsoids, (k, nx)."""
-    return np.sqrt(np.maximum(np.einsum("ia,kab,ib->ki", D, X, D), 0.0))
+    return np.asarray(np.sqrt(np.maximum(np.einsum("ia,kab,ib->ki", D, X, D), 0.0)))
 
 
 def _grid(S: Array, unit: Array) -> NDArray[np.int64]:

@@ -136,16 +136,16 @@ def sums(*, quick: bool = False) -> Table:
             off_m = max(off_m, abs(near.mean - float(exact.m)) / sd)
             off_s = max(off_s, abs(near.variance / float(exact.S) - 1))
         rows.append((f"{2 * L + 1} terms", round(fusion.best_spread(L), 3), worst, off_m, off_s))
-    exact: Source = Source(0.3, 0.5, 1.0)
-    every = few = fusion.GaussianSum.of(exact)
+    both: Source = Source(0.3, 0.5, 1.0)
+    every = few = fusion.GaussianSum.of(both)
     rng = np.random.default_rng(0)
     for _ in range(3):
         y = Source(rng.normal(0, 0.7), 0.4, 0.6)
         every, few = fusion.fuse_sums(every, y, 0.1, L=6), fusion.fuse_sums(few, y, 0.1, L=6, terms=40)
-        exact = fuse(exact, y, 0.1)
+        both = fuse(both, y, 0.1)
     sd = np.sqrt(every.variance)
     for name, m, S in (
-        ("mean and variance alone", float(exact.m), float(exact.S)),
+        ("mean and variance alone", float(both.m), float(both.S)),
         ("40 heaviest kept", few.mean, few.variance),
     ):
         rows.append((f"3 steps, {name}", None, None, abs(m - every.mean) / sd, abs(S / every.variance - 1)))
