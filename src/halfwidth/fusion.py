@@ -1,9 +1,9 @@
 """Fusion of two sources whose errors are partly bounded and partly Gaussian: the scalar estimator in full.
 
 ``x = z + e_x + c_x`` with ``e_x^2 <= E_x`` and ``c_x ~ N(0, S_x)``, and y likewise: eq. (1) of Hanebeck, Horn and
-Schmidt [1]_. Of the bounded errors nothing else is known, so their sets are fused by a convex combination with a scalar
-lambda; the midpoint ``w_x x + w_y y`` of the fused set is uncertain through the Gaussian errors, given that the two sets
-meet. Its density is known exactly (`density`), as a sum of Gaussians (`fuse_sums`), and by its mean and variance
+Schmidt [1]_. Of the bounded errors nothing else is known, so their sets are fused by a convex combination with a
+scalar lambda; the midpoint ``w_x x + w_y y`` of the fused set is uncertain through the Gaussian errors, given that the
+two sets meet. Its density is known exactly (`density`), as a sum of Gaussians (`fuse_sums`), and by its mean and variance
 (`fuse`), which is what the recursive estimator uses (`recursion`). Where no source has a set it is the Kalman filter,
 where none has a Gaussian error the set estimator. `halfwidth.MixedFilter` is the form for vectors and motion.
 

@@ -250,7 +250,7 @@ def test_an_output_never_makes_the_weighted_sum_wider():
             M = 9 * est.spread.P[-1] + est.info["X"][-1]
             if not sums:
                 size, along = np.diag(M), c @ M @ c
-            sums.append(np.sum(np.diag(M) / size) + 3 * (c @ M @ c) / along)
+            sums.append(np.sum(np.diag(M) / size) + 2 * (c @ M @ c) / along)
         assert sums[1] <= sums[0] * (1 + 1e-9)
 
 
