@@ -65,7 +65,7 @@ def draw(record, truth, estimates, path):
     figure = Figure(figsize=(8, 3.6), layout="constrained", dpi=120)
     ax = figure.subplots()
     base = truth.x[:, 0]
-    for name, colour in (("MixedFilter", "#2166ac"), ("Kalman, bound as variance", "#e08214")):
+    for name, colour in (("MixedWindow, 2 s late", "#2166ac"), ("Kalman, bound as variance", "#e08214")):
         est = estimates[name]
         lo, hi = (end[:, 0] - base for end in est.interval(0.99))
         ax.fill_between(est.t, lo, hi, color=colour, alpha=0.25, lw=0)

@@ -2,10 +2,11 @@
 
 ``x = z + e_x + c_x`` with ``e_x^2 <= E_x`` and ``c_x ~ N(0, S_x)``, and y likewise: eq. (1) of Hanebeck, Horn and
 Schmidt [1]_. Of the bounded errors nothing else is known, so their sets are fused by a convex combination with a
-scalar lambda; the midpoint ``w_x x + w_y y`` of the fused set is uncertain through the Gaussian errors, given that the
-two sets meet. Its density is known exactly (`density`), as a sum of Gaussians (`fuse_sums`), and by its mean and variance
-(`fuse`), which is what the recursive estimator uses (`recursion`). Where no source has a set it is the Kalman filter,
-where none has a Gaussian error the set estimator. `halfwidth.MixedFilter` is the form for vectors and motion.
+scalar lambda; the midpoint ``w_x x + w_y y`` of the fused set is uncertain through the Gaussian errors, given that
+the two sets meet. Its density is known exactly (`density`), as a sum of Gaussians (`fuse_sums`), and by its mean and
+variance (`fuse`), which is what the recursive estimator uses (`recursion`). Where no source has a set it is the
+Kalman filter, where none has a Gaussian error the set estimator. `halfwidth.MixedFilter` is the form for vectors and
+motion.
 
 The paper's ``erf`` is the normal distribution function minus 1/2, its eq. (20). Formulas that its print has lost are
 derived anew; they agree with those that stand, to rounding.

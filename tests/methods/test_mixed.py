@@ -474,3 +474,25 @@ def test_stream_with_a_model_that_follows_the_step():
     body = live.snapshot()[:-4].replace(b'"m": [', b'"m": [0.0, ')
     with pytest.raises(hw.BadValue, match="does not fit"):
         hw.resume(body + zlib.crc32(body).to_bytes(4, "little"), model)
+
+
+@pytest.mark.parametrize("lag", [0, 3])
+def test_the_window_on_line(lag):
+    """Row by row as in the batch, with missing entries and across a restart; what fits no model is told."""
+    case = next(c for c in CASES if c.name == "oscillator mixed")
+    method = hw.MixedWindow(memory=6, lag=lag)
+    batch = hw.estimate(case.model, case.record, method)
+    live = hw.stream(case.model, method)
+    for k, (y, u) in enumerate(zip(case.record.y, case.record.u, strict=True)):
+        if k == 20:
+            live = hw.resume(live.snapshot(), case.model)
+        newest = live.push(y, u)
+        if k >= lag:
+            np.testing.assert_allclose(newest.x[0], batch.x[k - lag], rtol=1e-9, atol=1e-10)
+            np.testing.assert_allclose(newest.spread.half[0], batch.spread.half[k - lag], rtol=1e-9)
+            np.testing.assert_allclose(newest.spread.P[0], batch.spread.P[k - lag], rtol=1e-9, atol=1e-12)
+            assert newest.t[0] == pytest.approx(case.record.t[k - lag])
+    other = dataclasses.replace(case.model, C=np.eye(3)[:2], E=None)
+    assert hw.resume(live.snapshot(), other).rows == 60
+    with pytest.raises(hw.Refused, match="KalmanSmoother"):
+        hw.stream(constant_velocity(), method)

@@ -241,13 +241,20 @@ class _NewestMixed(Newest):
 
 
 @dataclass(frozen=True, slots=True)
-class _Belief:
+class Pushed:
+    """What one push found, in the form that `halfwidth.result.Newest` reads."""
+
     t: float
     x: Array
     P: Array
     half: Array
     code: int
     rows: int
+
+
+def newest_kind(method: str, model: Linear) -> type[Newest]:
+    """Return the class of a stream's newest rows, with its method and names."""
+    return type("NewestMixed", (_NewestMixed,), {"__slots__": (), "method": method, "names": model.names.x})
 
 
 class MixedStream:
@@ -274,19 +281,27 @@ class MixedStream:
 
     def push(self, y: ArrayLike | None, u: ArrayLike | None = None, dt: float | None = None) -> Estimate:
         """Fold one row in and return the estimate of `lag` rows ago."""
+        _, out = self.pushed_rows(y, u, dt)
+        self.times = [*self.times[-int(self.method.lag) :], self.t] if self.method.lag else [self.t]
+        s = slice(self.model.nx * (len(self.times) - 1), self.model.nx * len(self.times))
+        belief = Pushed(self.times[0], out["m"][0, s], out["P"][0, s, s], out["half"][0, s], self.code, self.pushed)
+        newest: Estimate = object.__new__(self._kind)
+        object.__setattr__(newest, "_belief", belief)
+        return newest
+
+    def pushed_rows(
+        self, y: ArrayLike | None, u: ArrayLike | None, dt: float | None
+    ) -> tuple[MixedRows, dict[str, Any]]:
+        """Fold one row in; return it laid out, and what the kernel made of it."""
         row, inputs, step = pushed_row(self.model, y, u, dt)
-        out = self.method.rows(self._rows(row, inputs, step), self.belief)
+        laid = self._rows(row, inputs, step)
+        out = self.method.rows(laid, self.belief)
         self.belief = MixedBelief(out["m"][0], out["P"][0], out["X"][0], out["Z"])
         if self.code < 3:
             self.code = 3 if out["broken"] >= 0 else 2 if out["contradicted"][0] else 0
         self.t += step
         self.pushed += 1
-        self.times = [*self.times[-int(self.method.lag) :], self.t] if self.method.lag else [self.t]
-        s = slice(self.model.nx * (len(self.times) - 1), self.model.nx * len(self.times))
-        belief = _Belief(self.times[0], out["m"][0, s], out["P"][0, s, s], out["half"][0, s], self.code, self.pushed)
-        newest: Estimate = object.__new__(self._kind)
-        object.__setattr__(newest, "_belief", belief)
-        return newest
+        return laid, out
 
     def _rows(self, y: Array, u: Array | None, dt: float) -> MixedRows:
         """Lay one row out; of a constant model once for each set of outputs that are seen."""

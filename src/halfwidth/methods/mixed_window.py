@@ -19,19 +19,20 @@ References
 
 import contextlib
 import hashlib
+import json
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from halfwidth.array import Array
-from halfwidth.errors import BadValue, Missing
+from halfwidth.errors import BadValue, Missing, Refused, hinted
 from halfwidth.methods._mixed_rows import MixedRows, Stack, mixed_rows, refuses
 from halfwidth.methods._protocol import typed
-from halfwidth.methods.mixed import MixedBelief, MixedFilter, prior
+from halfwidth.methods.mixed import MixedBelief, MixedFilter, Pushed, newest_kind, prior
 from halfwidth.model import Linear, Model
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
@@ -105,18 +106,15 @@ class MixedWindow:
                 failed.extend(at.tolist())
                 continue
             first = at - window.target
-            before = first - 1
-            m, S, X = (
-                np.broadcast_to(prior_part, (len(at), *prior_part.shape)) if first[0] == 0 else part[before]
-                for prior_part, part in zip(start[:3], filtered[:3], strict=True)
-            )
+            if first[0] == 0:  # the prior stands before the window
+                before = _single(start, start.Z)
+            else:
+                k = first - 1
+                before = MixedBelief(filtered.m[k], filtered.P[k], filtered.X[k], start.Z[:0])
             inside = first[:, None] + np.arange(window.rows)
             y = rows.y[inside].reshape(len(at), -1)[:, window.seen.ravel()]
             b = None if rows.b is None else rows.b[inside].reshape(len(at), -1)
-            x[at] = m @ found.D0.T + y @ found.L.T + (0.0 if b is None else b @ found.D.T)
-            P[at] = found.D0 @ S @ found.D0.T + found.P
-            set_ = np.abs(found.D0 @ start.Z.T).sum(axis=1) if first[0] == 0 else _reach(found.D0, X)
-            half[at] = set_ + found.half
+            x[at], P[at], half[at] = found.apply(before, y, b)
         info: dict[str, Any] = {"designs": len(groups)}
         status = Status.OK
         if out["broken"] >= 0:
@@ -126,9 +124,13 @@ class MixedWindow:
             status = Status.REDUCED
             info["message"] = f"{len(failed)} rows have the filter's estimate, first t = {record.t[min(failed)]:.6g} s"
         return Estimate(
-            record.t, x, Both(x, 0.5 * (P + np.swapaxes(P, 1, 2)), half), status, typed(self),
+            record.t, x, Both(x, P, half), status, typed(self),
             names=model.names.x, labels=record.labels, info=info,
         )  # fmt: skip
+
+    def stream(self, model: Linear, t: float = 0.0) -> "WindowStream":
+        """Return the online form; each push gives the estimate of `lag` rows ago."""
+        return WindowStream(self, model, t)
 
     def _groups(
         self, rows: MixedRows, start: MixedBelief, filtered: MixedBelief
@@ -141,9 +143,7 @@ class MixedWindow:
         kind = motion * (int(output.max()) + 1) + output
         inside = first[:, None] + np.arange(self.memory)
         kinds = np.where(inside <= end[:, None], kind[np.minimum(inside, T - 1)], -1)
-        # sizes are rounded in units of those after the first row, so that the user's units do not matter
-        unit = np.sqrt(np.maximum(np.diagonal(self.kappa**2 * filtered.P[0] + filtered.X[0]), 0.0))
-        unit = np.where(unit > 0, unit, 1.0)
+        unit = _unit(filtered.P[0], filtered.X[0], self.kappa)
         rounded = np.concatenate([_grid(S, unit) for S in filtered[1:3]], axis=1)
         arrival = np.where(first[:, None] > 0, rounded[np.maximum(first - 1, 0)], _NONE)
         keys = np.column_stack([np.arange(T) - first, kinds, arrival])
@@ -154,8 +154,7 @@ class MixedWindow:
             a, e = int(first[t]), int(end[t])
             belief = start
             if a > 0:
-                P, X = (_of_grid(part, unit) for part in np.split(rounded[a - 1], 2))
-                belief = MixedBelief(start.m, P, X, start.Z[:0])
+                belief = _rounded(rounded[a - 1], unit, start)
             yield at, _window(rows, motion, output, a, e, t - a), belief
 
 
@@ -191,6 +190,21 @@ class Design(NamedTuple):
     L: Array
     P: Array
     half: Array
+
+    def apply(self, before: MixedBelief, y: Array, b: Array | None) -> tuple[Array, Array, Array]:
+        """Return estimates (k, nx), covariances and half-widths of k windows with these gains.
+
+        `before` holds the beliefs before the windows, (k, nx) and (k, nx, nx), or one prior with its generators; y are
+        the outputs seen in them (k, .), b what inputs add to their states (k, rows nx).
+        """
+        x = before.m @ self.D0.T + y @ self.L.T
+        x = x if b is None else x + b @ self.D.T
+        P = self.D0 @ before.P @ self.D0.T + self.P
+        if len(before.Z):
+            reach = np.abs(self.D0 @ before.Z.T).sum(axis=1)
+        else:
+            reach = np.sqrt(np.maximum(np.einsum("ia,kab,ib->ki", self.D0, before.X, self.D0), 0.0))
+        return x, 0.5 * (P + np.swapaxes(P, 1, 2)), reach + self.half
 
 
 def _window(
@@ -409,9 +423,21 @@ def _root(S: Array) -> Array:
     return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
 
 
-def _reach(D: Array, X: Array) -> Array:
-    """Return half-widths of D times ellipsoids, (k, nx)."""
-    return np.asarray(np.sqrt(np.maximum(np.einsum("ia,kab,ib->ki", D, X, D), 0.0)))
+def _single(belief: MixedBelief, Z: Array) -> MixedBelief:
+    """Return one belief as a stack of one, with other generators."""
+    return MixedBelief(belief.m[None], belief.P[None], belief.X[None], Z)
+
+
+def _unit(P: Array, X: Array, kappa: float) -> Array:
+    """Return the sizes after the first row, in whose units beliefs are rounded: the user's units do not matter."""
+    size = np.sqrt(np.maximum(np.diagonal(kappa**2 * P + X), 0.0))
+    return np.where(size > 0, size, 1.0)
+
+
+def _rounded(grid: NDArray[np.int64], unit: Array, start: MixedBelief) -> MixedBelief:
+    """Return the belief of a point of the grid."""
+    P, X = (_of_grid(part, unit) for part in np.split(grid, 2))
+    return MixedBelief(start.m, P, X, start.Z[:0])
 
 
 def _grid(S: Array, unit: Array) -> NDArray[np.int64]:
@@ -432,4 +458,104 @@ def _of_grid(grid: NDArray[np.int64], unit: Array) -> Array:
     return np.asarray(size[:, None] * (root @ root.T) * size)
 
 
-__all__ = ["Design", "MixedWindow", "design", "optimal"]
+# ---- row by row ------------------------------------------------------------------------------------------------------
+
+
+class WindowStream:
+    """A `MixedWindow` that holds its newest rows, and the filter's beliefs before each."""
+
+    def __init__(self, method: MixedWindow, model: Linear, t: float) -> None:
+        reason = method.refuses(model)
+        if reason is not None:
+            message, hint = hinted(reason)
+            raise Refused(message, hint=hint)
+        self.method, self.model = method, model
+        self.filter = MixedFilter(form="ellipsoid", kappa=method.kappa).stream(model, t)
+        self.start = prior(model)
+        self.unit: Array | None = None
+        self.rows: list[tuple[MixedRows, MixedBelief, float]] = []  # laid out, the belief after, the time
+        self._kind = newest_kind(typed(method), model)
+
+    @property
+    def t(self) -> float:
+        """Time of the newest row, s."""
+        return self.filter.t
+
+    @property
+    def pushed(self) -> int:
+        """Number of rows pushed so far."""
+        return self.filter.pushed
+
+    def push(self, y: ArrayLike | None, u: ArrayLike | None = None, dt: float | None = None) -> Estimate:
+        """Fold one row in and return the estimate of `lag` rows ago."""
+        laid, out = self.filter.pushed_rows(y, u, dt)
+        if self.unit is None:
+            self.unit = _unit(out["P"][0], out["X"][0], self.method.kappa)
+        self.rows = [*self.rows[-int(self.method.memory) :], (laid, self.filter.belief, self.filter.t)]
+        first = 0 if self.pushed <= self.method.memory else 1  # of a full window the row before it is held too
+        held = self.rows[first:]
+        target = max(len(held) - 1 - int(self.method.lag), 0)
+        rows = [one for one, _, _ in held]
+        A, Q, G, C, r, half = (np.concatenate([getattr(one, name)[0] for one in rows]) for name in _LAID)
+        seen = np.concatenate([one.seen for one in rows])
+        window = _Window(A, Q, G, C, r[:, 0], half[:, 0], seen, target)
+        if first == 0:
+            arrival, before = self.start, _single(self.start, self.start.Z)
+        else:
+            _, belief, _ = self.rows[0]
+            grid = np.concatenate([_grid(S[None], self.unit)[0] for S in belief[1:3]])
+            arrival = _rounded(grid, self.unit, self.start)
+            before = _single(belief, self.start.Z[:0])
+        found = design(window, arrival, self.method.kappa)
+        code = self.filter.code
+        if found is None:
+            _, belief, _ = held[target]
+            x, P, reach = belief.m, belief.P, np.sqrt(np.maximum(np.diagonal(belief.X), 0.0))
+            code = max(code, 2)
+        else:
+            outputs = np.concatenate([one.y for one in rows])[window.seen]
+            b = None if rows[0].b is None else np.concatenate([one.b[0] for one in rows if one.b is not None])[None]
+            x, P, reach = (part[0] for part in found.apply(before, outputs[None], b))
+        newest: Estimate = object.__new__(self._kind)
+        object.__setattr__(newest, "_belief", Pushed(held[target][2], x, P, reach, code, self.pushed))
+        return newest
+
+    def snapshot(self) -> bytes:
+        """Return the rows held and the filter's belief, as bytes."""
+        rows = [
+            {
+                "t": t, "y": one.y.tolist(), "b": None if one.b is None else one.b.tolist(), "seen": one.seen.tolist(),
+                "laid": {name: getattr(one, name)[0].tolist() for name in _LAID},
+                "belief": [part.tolist() for part in belief[:3]],
+            }
+            for one, belief, t in self.rows
+        ]  # fmt: skip
+        unit = None if self.unit is None else self.unit.tolist()
+        return json.dumps({"filter": self.filter.snapshot().decode(), "unit": unit, "rows": rows}).encode()
+
+    def restore(self, saved: bytes) -> None:
+        """Take up the rows of a snapshot."""
+        held = json.loads(saved)
+        self.filter.restore(held["filter"].encode())
+        self.unit = None if held["unit"] is None else np.array(held["unit"], dtype=float)
+        self.rows = []
+        n, ny = self.model.nx, self.model.ny
+        for row in held["rows"]:
+            stacks = {name: np.array(row["laid"][name], dtype=float) for name in _LAID}
+            stacks["G"] = stacks["G"].reshape(1, n, -1)
+            if stacks["A"].shape != (1, n, n) or stacks["C"].shape != (1, ny, n):
+                raise ValueError(f"it holds rows of another model than one with {n} states and {ny} outputs")
+            b = None if row["b"] is None else np.array(row["b"], dtype=float)
+            laid = MixedRows(
+                **{name: (stack, None) for name, stack in stacks.items()}, b=b, y=np.array(row["y"], dtype=float),
+                seen=np.array(row["seen"], dtype=bool), B=None, M=(np.eye(ny)[None], None),
+            )  # fmt: skip
+            m, P, X = (np.array(part, dtype=float) for part in row["belief"])
+            belief = MixedBelief(m, P, X, np.zeros((0, n)))
+            self.rows.append((laid, belief, float(row["t"])))
+
+
+#: Parts of a row that a window reads.
+_LAID = ("A", "Q", "G", "C", "r", "half")
+
+__all__ = ["Design", "MixedWindow", "WindowStream", "design", "optimal"]
