@@ -117,7 +117,7 @@ def _settings():
         "UnscentedKalman": [{"smooth": True}],
         "MixedFilter": [{"form": "ellipsoid", "gain": "set"}, {"form": "zonotope", "lag": 4}],
     }
-    quick = {"MixedWindow": {"memory": 4}}  # a small window: each row of a record with holes is a design of its own
+    quick = {"MixedWindow": {"memory": 2}}  # a small window: each row of a record with holes is a design of its own
     found = []
     for name in ESTIMATORS:
         found.append(load(name)(**quick.get(name, {})))
