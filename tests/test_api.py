@@ -7,9 +7,9 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud Constrained DataQualityWarning Estimate
+BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Both Box Cloud Constrained DataQualityWarning Estimate
 Estimator ExtendedKalman FearnheadClifford GPB Gaussian Halfspaces HalfwidthError KalmanFilter KalmanSmoother Learned Linear
-LogTooBig Markov MemoryChoice Missing Mixed Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls
+LogTooBig Markov MemoryChoice Missing Mixed MixedFilter MixedWindow Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls
 SequentialLP Status Uniform UnscentedKalman Unsolved Window __version__ choose_memory ensemble_interval estimate
 forecast from_continuous learn resume score simulate stream
 """
@@ -27,7 +27,7 @@ def test_an_unknown_name_is_an_attribute_error():
 
 
 def test_importing_loads_no_optional_library():
-    heavy = ["scipy", "pandas", "polars", "pyarrow", "matplotlib", "narwhals", "typer", "highspy", "piqp"]
+    heavy = ["scipy", "pandas", "polars", "pyarrow", "matplotlib", "narwhals", "typer", "highspy", "piqp", "clarabel"]
     code = (
         f"import sys, halfwidth; halfwidth.Linear; halfwidth.estimate; print([m for m in {heavy} if m in sys.modules])"
     )

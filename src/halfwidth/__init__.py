@@ -22,6 +22,7 @@ _HOME: dict[str, str] = {
     "Box": "spread",
     "Halfspaces": "spread",
     "Normal": "spread",
+    "Both": "spread",
     "Cloud": "spread",
     "Bernoulli": "loss",
     "Markov": "loss",
@@ -89,6 +90,8 @@ if TYPE_CHECKING:
     from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
     from halfwidth.methods.loss import Runnalls as Runnalls
     from halfwidth.methods.map import BatchLP as BatchLP
+    from halfwidth.methods.mixed import MixedFilter as MixedFilter
+    from halfwidth.methods.mixed_window import MixedWindow as MixedWindow
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
@@ -107,6 +110,7 @@ if TYPE_CHECKING:
     from halfwidth.result import Status as Status
     from halfwidth.score import score as score
     from halfwidth.simulate import simulate as simulate
+    from halfwidth.spread import Both as Both
     from halfwidth.spread import Box as Box
     from halfwidth.spread import Cloud as Cloud
     from halfwidth.spread import Halfspaces as Halfspaces
@@ -114,4 +118,4 @@ if TYPE_CHECKING:
     from halfwidth.stream import resume as resume
     from halfwidth.stream import stream as stream
 
-lazy(__name__, _HOME | {"vehicle": "vehicle"})
+lazy(__name__, _HOME | {"vehicle": "vehicle", "fusion": "fusion"})

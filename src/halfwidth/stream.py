@@ -116,7 +116,7 @@ def stream(model: Model, method: Any = None, *, t: float = 0.0) -> Stream:
 def _default(model: Model) -> Any:
     """Return the first recursive method that takes the model."""
     reasons = []
-    for name in ("KalmanFilter", "UnscentedKalman", "GPB"):
+    for name in ("KalmanFilter", "UnscentedKalman", "GPB", "MixedFilter"):
         if name in methods.ESTIMATORS:
             method = methods.load(name)()
             reason = method.refuses(model)

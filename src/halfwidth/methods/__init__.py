@@ -21,6 +21,8 @@ ESTIMATORS: dict[str, str] = {
     "SequentialLP": "sequential",
     "Window": "window",
     "Constrained": "constrain",
+    "MixedFilter": "mixed",
+    "MixedWindow": "mixed_window",
 }
 
 
