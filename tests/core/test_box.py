@@ -34,11 +34,14 @@ def both(parts, sweeps):
         E, A[0], C[0], *bx, *by, lo, hi, sweeps=sweeps, A_hi=None if (A[0] == A[1]).all() else A[1], C_hi=C[1]
     )
     T = len(bx[0])
-    pair = lambda low, high: list(zip(map(naive_box.exact, low), map(naive_box.exact, high)))  # noqa: E731
-    rows = lambda X: [
-        [pair(low, high) for low, high in zip(*(m if m.ndim == 2 else m[t] for m in X))] for t in range(T)
-    ]  # noqa: E731
-    vectors = lambda X: [pair(low, high) for low, high in zip(*X)]  # noqa: E731
+
+    def vectors(X):
+        ends = (map(naive_box.exact, np.ravel(end)) for end in X)
+        return np.array([*zip(*ends, strict=True)], dtype=object).reshape(*X[0].shape, 2).tolist()
+
+    def rows(X):
+        return [vectors([end if end.ndim == 2 else end[t] for end in X]) for t in range(T)]
+
     want = naive_box.contract(rows((E, E)), rows(A), rows(C), vectors(bx), vectors(by), vectors((lo, hi)), sweeps)
     return got, want
 
@@ -134,5 +137,5 @@ def test_instruction_sets_agree():
         there = both(parts, 1)[0]
     finally:
         _core.use_isa(True)
-    for a, b in zip(here, there):
+    for a, b in zip(here, there, strict=True):
         np.testing.assert_array_equal(a, b)
