@@ -21,6 +21,8 @@
 namespace hw {
 namespace HW_ISA {
 
+constexpr double inf = __builtin_inf();
+
 template <int N>
 struct HullIpm {
     static constexpr int P = 4;
@@ -38,7 +40,7 @@ struct HullIpm {
     // per lane
     V *z, *dz, *f, *c;   // (K+1,n)
     V *w, *l, *iw, *u;   // (K+1,2G)
-    V *W, *g;            // (K+1,G)
+    V *W, *g, *d;        // (K+1,G) d = M z - b
     V *L, *O;            // (K+1,n,n)
     V* work;             // 4 n
 
@@ -54,7 +56,7 @@ struct HullIpm {
         k.many(s * n, S, z, dz, f, c);
         k.many(K * nn, E, A);
         C = k.take<double>(I(K) * m * n);
-        k.many(s * G, b, scale, live, W, g);
+        k.many(s * G, b, scale, live, W, g, d);
         k.many(s * 2 * G, w, l, iw, u);
         k.many(s * nn, L, O);
         work = k.take<V>(4 * n);
@@ -225,7 +227,8 @@ struct HullIpm {
                        t < K ? O + (t + 1) * nn : nullptr, t < K ? dz + I(t + 1) * n : nullptr, dz + I(t) * n);
     }
 
-    // Four costs (n each, at states k): y (K, n+m) each, the objective and gap reached; returns the iterations taken.
+    // Four costs (n each, at states k): y (K, n+m) each, the objective (minus infinity if not converged), the gap or
+    // residual reached; returns the iterations taken.
     int solve(const double* const* cost, const int* k, int costs, double* const* y, double* value, double* gap) {
         const int kinds = n + m;
         double unit_of[P];
@@ -262,13 +265,13 @@ struct HullIpm {
                     W[at] = g[at] = V(0.0);
                     continue;
                 }
-                const V d = rho(z, t, i) - V(b[at]);
-                w[2 * at] = larger(V(1.0) - d, V(0.5));
-                w[2 * at + 1] = larger(V(1.0) + d, V(0.5));
+                d[at] = rho(z, t, i) - V(b[at]);
+                w[2 * at] = larger(V(1.0) - d[at], V(0.5));
+                w[2 * at + 1] = larger(V(1.0) + d[at], V(0.5));
                 l[2 * at] = V(first / pairs) / w[2 * at];
                 l[2 * at + 1] = V(first / pairs) / w[2 * at + 1];
             }
-        V moving = V(1.0), best_gap = V(1e300), dres = V(1.0);
+        V moving = V(1.0), dres = V(1.0), reached = V(inf);
         int iter = 0;
         V mu_sum = V(0.0);
         for (; iter < set.max_iter; iter++) {
@@ -279,10 +282,9 @@ struct HullIpm {
                 for (int i = 0; i < G; i++) {
                     const I at = I(t) * G + i;
                     if (!live[at]) continue;
-                    const V d = rho(z, t, i) - V(b[at]);
                     const V wp = w[2 * at], wm = w[2 * at + 1], lp = l[2 * at], lm = l[2 * at + 1];
                     const V ip = V(1.0) / wp, im = V(1.0) / wm;
-                    const V dp = lp * ip, dm = lm * im, rp = V(1.0) - d - wp, rm = V(1.0) + d - wm;
+                    const V dp = lp * ip, dm = lm * im, rp = V(1.0) - d[at] - wp, rm = V(1.0) + d[at] - wm;
                     iw[2 * at] = ip;
                     iw[2 * at + 1] = im;
                     W[at] = dp + dm;
@@ -291,6 +293,7 @@ struct HullIpm {
                     pres = larger(pres, larger(magnitude(rp), magnitude(rm)));
                 }
             const V merit = larger(mu_sum, larger(pres, dres));
+            reached = merit;
             bool done = true;
             for (int p = 0; p < P; p++) {
                 if (!(merit[p] > set.tol)) moving.set(p, 0.0);
@@ -306,9 +309,9 @@ struct HullIpm {
                 for (int i = 0; i < G; i++) {
                     const I at = I(t) * G + i;
                     if (!live[at]) continue;
-                    const V d = rho(z, t, i) - V(b[at]), dd = rho(dz, t, i);
+                    const V dd = rho(dz, t, i), rest[2] = {V(1.0) - d[at] - dd, V(1.0) + d[at] + dd};
                     for (int side = 0; side < 2; side++) {
-                        const V wk = w[2 * at + side], step = side ? V(1.0) + d - wk + dd : V(1.0) - d - wk - dd;
+                        const V wk = w[2 * at + side], step = rest[side] - wk;
                         const V uk = step * iw[2 * at + side], vk = -V(1.0) - uk, p = wk * l[2 * at + side];
                         u[2 * at + side] = uk;
                         up_ = larger(up_, -uk);
@@ -345,16 +348,17 @@ struct HullIpm {
                 for (int i = 0; i < G; i++) {
                     const I at = I(t) * G + i;
                     if (!live[at]) continue;
-                    const V d = rho(z, t, i) - V(b[at]), dd = rho(dz, t, i);
+                    const V dd = rho(dz, t, i), rest[2] = {V(1.0) - d[at] - dd, V(1.0) + d[at] + dd};
                     for (int side = 0; side < 2; side++) {
                         const V wk = w[2 * at + side], lk = l[2 * at + side];
-                        const V dw = side ? V(1.0) + d - wk + dd : V(1.0) - d - wk - dd;
+                        const V dw = rest[side] - wk;
                         const V dl = u[2 * at + side] - lk - lk * iw[2 * at + side] * dw;
                         up_ = larger(up_, -(dw * iw[2 * at + side]));
                         ud = larger(ud, -(dl / lk));
                         u[2 * at + side] = dl;
                         iw[2 * at + side] = dw;
                     }
+                    W[at] = dd;
                 }
             V ap, ad;
             for (int p = 0; p < P; p++) {
@@ -369,18 +373,18 @@ struct HullIpm {
             for (I i = 0; i < I(K + 1) * n; i++) z[i] += where_positive(ap, ap * dz[i], V(0.0));
             for (I at = 0; at < I(K + 1) * G; at++) {
                 if (!live[at]) continue;
+                d[at] += where_positive(ap, ap * W[at], V(0.0));
                 for (int side = 0; side < 2; side++) {
                     w[2 * at + side] += where_positive(ap, ap * iw[2 * at + side], V(0.0));
                     l[2 * at + side] += where_positive(ad, ad * u[2 * at + side], V(0.0));
                 }
             }
         }
-        (void)best_gap;
         for (int p = 0; p < costs; p++) {
             double v = 0.0;
             for (int j = 0; j < n; j++) v += cost[p][j] * (r.mid[I(k[p]) * n + j] + S[I(k[p]) * n + j] * z[I(k[p]) * n + j][p]);
-            value[p] = v;
-            gap[p] = mu_sum[p];
+            value[p] = reached[p] <= 1e-7 ? v : -inf;
+            gap[p] = reached[p];
             for (int t = 0; t < K; t++)
                 for (int i = 0; i < kinds; i++) {
                     const I at = I(t + 1) * G + n + i;
