@@ -7,6 +7,7 @@ Where the bound and the solver's own objective disagree, the window is asked aga
 end of the stock solver.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -74,64 +75,68 @@ class Boxes:
 
     def narrow(self, a: int, b: int, states: Sequence[int]) -> Empty | None:
         """Narrow the boxes of the window of states a to b, and fully those of the states named, by rows a to b - 1."""
-        nx = self.rows.nx
-        failed = self._finite(a, b)
-        if failed is not None:
-            return failed
-        there = np.isfinite(self.lo[a : b + 1]) & np.isfinite(self.hi[a : b + 1])
-        lost = np.flatnonzero(~there.all(axis=1))
-        part, lo, hi = self.rows.part(a, b), self.lo[a : b + 1].copy(), self.hi[a : b + 1].copy()
-        if lost.size:
-            # Rows after the last unbounded state still hold all that they say of the states after it.
-            cut = int(lost[-1])
-            if a + cut == b:
-                return None
-            a, part, lo, hi = a + cut, part.part(cut, part.T).without_dynamics(0), lo[cut:], hi[cut:]
-            lo[0] = hi[0] = 0.0
-            states = [k for k in states if k > a]
-            if not states:
-                return None
-        c = np.tile(np.vstack((np.eye(nx), -np.eye(nx))), (len(states), 1))
-        k = np.repeat(np.asarray(states, dtype=np.int32) - np.int32(a), 2 * nx)
-        return self._solve(Question(part, lo, hi, c, k), a, b, dummy=bool(lost.size))
+        part, lo, hi, first = self.rows.part(a, b), self.lo[a : b + 1], self.hi[a : b + 1], a
+        if not (np.isfinite(lo).all() and np.isfinite(hi).all()):
+            failed = self.finite(a, b)
+            if failed is not None:
+                return failed
+            lost = np.flatnonzero(~(np.isfinite(lo) & np.isfinite(hi)).all(axis=1))
+            if lost.size:
+                # Rows after the last unbounded state still hold all that they say of the states after it: it becomes a
+                # state that no row knows.
+                cut = int(lost[-1])
+                states = [k for k in states if k > a + cut]
+                if not states:
+                    return None
+                first, part = a + cut, part.part(cut, b - a).without_dynamics(0)
+                lo, hi = lo[cut:].copy(), hi[cut:].copy()
+                lo[0] = hi[0] = 0.0
+        c, k = sides(self.rows.nx, tuple(int(s) - first for s in states))
+        found = self._solved(Question(part, lo, hi, c, k), first)
+        if isinstance(found, Empty):
+            return found
+        lo, hi = found
+        known = 0 if first == a else 1
+        np.maximum(self.lo[first + known : b + 1], lo[known:], out=self.lo[first + known : b + 1])
+        np.minimum(self.hi[first + known : b + 1], hi[known:], out=self.hi[first + known : b + 1])
+        return None
 
-    def _solve(self, ask: Question, a: int, b: int, *, dummy: bool) -> Empty | None:
-        """Bound both sides of every entry, again until the bounds are tight; take the boxes over."""
-        nx, kinds, best = self.rows.nx, self.rows.nx + self.rows.ny, np.full(len(ask.c), np.inf)
-        lo, hi, where = ask.lo, ask.hi, ask.k[:: 2 * self.rows.nx]
-        self.asked += len(best)
-        off = np.full(len(best), np.inf)  # from the objective that the last proposer claims
-        y = np.zeros((len(best), ask.rows.T, kinds))
-        wrong = far = off > 0
-        for round_, proposer in enumerate([self.proposers[0]] * _ROUNDS + list(self.proposers[1:])):
+    def _solved(self, ask: Question, a: int) -> "Empty | tuple[Array, Array]":
+        """Return the boxes of a window with the sides that are asked for, asking again until they are tight."""
+        nx, kinds, T = self.rows.nx, self.rows.nx + self.rows.ny, ask.rows.T
+        lo, hi, where = ask.lo, ask.hi, ask.k[:: 2 * nx]
+        self.asked += len(ask.c)
+        best, y, value, lo, hi, bad = bounded(ask, self.proposers[0], contract=True)
+        if bad:
+            return Empty(a, a + T, None, a * kinds + bad - 1)
+        rest = [self.proposers[0]] * _ROUNDS + list(self.proposers[1:])
+        for step in range(len(rest) + 1):
+            both = best.reshape(-1, 2, nx)
+            upper, lower = both[:, 0], -both[:, 1]
+            if (lower > upper).any():
+                k, j = np.argwhere(lower > upper)[0]
+                pair = y.reshape(-1, 2, nx, T, kinds)[k, :, j]
+                return Empty(a, a + T, pair[0] + pair[1], None)
+            np.maximum(lower, lo[where], out=lower)
+            upper = np.minimum(upper, hi[where])
+            if (lower > upper).any():
+                return Empty(a, a + T, None, None)
+            lo[where], hi[where] = lower, upper
+            width, size = upper - lower, np.maximum(np.abs(lower), np.abs(upper))
+            off = (best - value).reshape(-1, 2, nx)
+            # An objective above the bound is a lie, one far below it a bad answer.
+            wrong = ~(np.abs(off) <= (LOOSE * width + 1e-13 * size)[:, None]).ravel()
+            if not wrong.any():
+                return lo, hi
+            if step == len(rest):
+                break
             some = np.flatnonzero(wrong)
             now = Question(ask.rows, lo, hi, np.ascontiguousarray(ask.c[some]), np.ascontiguousarray(ask.k[some]))
-            bound, new, value, lo, hi, bad = bounded(now, proposer, contract=round_ == 0)
-            if bad:
-                return Empty(a, b, None, a * kinds + bad - 1)
+            bound, new, claim, lo, hi, _ = bounded(now, rest[step], contract=False)
             better = bound < best[some]
-            best[some[better]] = bound[better]
-            y[some[better]] = new[better]
-            upper, lower = best.reshape(-1, 2, nx)[:, 0], -best.reshape(-1, 2, nx)[:, 1]
-            crossed = np.argwhere(lower > upper)
-            if crossed.size:
-                pair = y.reshape(-1, 2, nx, ask.rows.T, kinds)[crossed[0, 0], :, crossed[0, 1]]
-                return Empty(a, b, pair[0] + pair[1], None)
-            lo[where], hi[where] = np.maximum(lo[where], lower), np.minimum(hi[where], upper)
-            if np.any(lo[where] > hi[where]):
-                return Empty(a, b, None, None)
-            width = np.repeat((hi - lo)[where][:, None], 2, axis=1).reshape(-1)
-            size = (np.abs(ask.c) * np.maximum(np.abs(lo), np.abs(hi))[ask.k]).sum(axis=1)
-            off[some] = best[some] - value
-            wrong = ~(off <= LOOSE * width + 1e-13 * size)
-            far = ~(off <= _REPORT * width + 1e-12 * size)
-            if not wrong.any():
-                break
-        self.loose += int(np.count_nonzero(far))
-        first = 1 if dummy else 0
-        self.lo[a + first : b + 1] = np.maximum(self.lo[a + first : b + 1], lo[first:])
-        self.hi[a + first : b + 1] = np.minimum(self.hi[a + first : b + 1], hi[first:])
-        return None
+            best[some[better]], y[some[better]], value[some] = bound[better], new[better], claim
+        self.loose += int(np.count_nonzero(~(np.abs(off) <= (_REPORT * width + 1e-12 * size)[:, None])))
+        return lo, hi
 
     def functional(self, a: int, b: int, c: Array, state: int) -> tuple[float, float]:
         """Return bounds of c'x at one state by rows a to b - 1; infinite where there is none."""
@@ -145,7 +150,7 @@ class Boxes:
                 break
         return float(-best[1]), float(best[0])
 
-    def _finite(self, a: int, b: int) -> Empty | None:
+    def finite(self, a: int, b: int) -> Empty | None:
         """Try to give every state of a window a finite box: by contraction, then by a left inverse of its rows."""
         if np.isfinite(self.lo[a : b + 1]).all() and np.isfinite(self.hi[a : b + 1]).all():
             return None
@@ -195,6 +200,13 @@ class Boxes:
         return True
 
 
+@functools.lru_cache(maxsize=256)
+def sides(nx: int, states: tuple[int, ...]) -> tuple[Array, NDArray[np.int32]]:
+    """Return the functionals +x_j, -x_j of states of a window, and the state of each; not to be changed."""
+    c = np.tile(np.vstack((np.eye(nx), -np.eye(nx))), (len(states), 1))
+    return c, np.repeat(np.array(states, dtype=np.int32), 2 * nx)
+
+
 def bounded(
     ask: Question, proposer: Proposer | None, *, contract: bool
 ) -> tuple[Array, Array, Array, Array, Array, int]:
@@ -212,13 +224,13 @@ def bounded(
     shape = (len(ask.c), r.T, r.nx + r.ny)
     try:
         y = np.ascontiguousarray(np.broadcast_to(np.asarray(y, dtype=np.float64), shape))
-        value = np.broadcast_to(np.asarray(value, dtype=np.float64), (len(ask.c),))
+        value = np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), (len(ask.c),)))
     except (TypeError, ValueError):
         y, value = np.zeros(shape), np.full(len(ask.c), -np.inf)
     bound, y, _, _, lo, hi, _, bad = _core.hull_window(
         *given, ask.lo, ask.hi, ask.c, ask.k, y=y, sweeps=sweeps, **last
     )
-    return bound, y, np.asarray(value), lo, hi, int(bad)
+    return bound, y, value, lo, hi, int(bad)
 
 
 def stock(ask: Question) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.methods._bounds import Rows
-from halfwidth.methods._boxes import Empty, Question, bounded, sparse_rows
+from halfwidth.methods._boxes import Boxes, Empty, Question, bounded, sparse_rows
 
 #: A row's share of the ray below which it is not named.
 _SHARE = 1e-6
@@ -112,7 +112,7 @@ def _least_growth(rows: Rows, lo: Array, hi: Array) -> tuple[float, Array, Array
 
     M, low, high = sparse_rows(rows)
     seen: NDArray[np.bool_] = np.isfinite(low) & np.isfinite(high)
-    M, mid, half = M[seen], 0.5 * (low + high)[seen], 0.5 * (high - low)[seen]
+    M, mid, half = M[seen], 0.5 * (low[seen] + high[seen]), 0.5 * (high[seen] - low[seen])
     column = sp.csr_array(half[:, None])
     none = np.full(len(mid), np.inf)
     size = M.shape[1]
@@ -136,16 +136,21 @@ def _least_growth(rows: Rows, lo: Array, hi: Array) -> tuple[float, Array, Array
 
 def _refuted(rows: Rows, lo: Array, hi: Array, y: Array) -> bool:
     """Say whether multipliers prove that no trajectory fits: a bound of 0'x below 0."""
-    ask = Question(rows, lo, hi, np.zeros((1, rows.nx)), np.zeros(1, dtype=np.int32))
-    # Unbounded states take any rounding for infinite: their boxes are found by contraction first.
+    boxes = Boxes(rows, lo.copy(), hi.copy(), ())
+    # To an unbounded state any rounding is infinite, so such states are given boxes first.
+    if boxes.finite(0, rows.T) is not None:
+        return True
+    ask = Question(rows, boxes.lo, boxes.hi, np.zeros((1, rows.nx)), np.zeros(1, dtype=np.int32))
     bound, _, _, _, _, bad = bounded(ask, lambda _: (y[None], np.zeros(1)), contract=True)
     return bool(bad) or bool(bound[0] < 0.0)
 
 
 def _named(rows: Rows, y: Array, t: Array, names: tuple[tuple[str, ...], tuple[str, ...]]) -> tuple[Culprit, ...]:
     """Return the rows with a share in the ray, weighed by their half-widths where they have one."""
-    half = 0.5 * np.concatenate((rows.bx_hi - rows.bx_lo, rows.by_hi - rows.by_lo), axis=1)
-    weight = np.abs(y) * np.where(np.isfinite(half), half, 0.0)
+    low, high = (np.concatenate((getattr(rows, f"bx_{end}"), getattr(rows, f"by_{end}")), axis=1) for end in ("lo", "hi"))
+    there = np.isfinite(low) & np.isfinite(high)
+    half = 0.5 * (np.where(there, high, 0.0) - np.where(there, low, 0.0))
+    weight = np.abs(y) * half
     if not weight.sum() > 0:
         weight = np.abs(y)
     total = float(weight.sum())
