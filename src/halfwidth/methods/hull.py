@@ -410,12 +410,10 @@ class _Live:
         self.pushed += 1
         if self.empty is not None:
             return self._infeasible(self.empty)
-        self.rows = rows
-        self.times.append(t)
-        self.seen = np.vstack((self.seen, ~np.isnan(row)))
-        lag, newest = 0 if self.hull.lag is None else int(self.hull.lag), len(self.times) - 1
+        times, seen = [*self.times, t], np.vstack((self.seen, ~np.isnan(row)))
+        lag, newest = 0 if self.hull.lag is None else int(self.hull.lag), len(times) - 1
         wanted = max(newest - lag, 0)
-        start = self._starts(self.seen)
+        start = self._starts(seen)
         boxes = Boxes(rows, np.vstack((self.lo, self.free[0])), np.vstack((self.hi, self.free[1])), _PROPOSERS)
         given = boxes.lo.copy(), boxes.hi.copy()
         done = [wanted] if self.pushed > lag else []
@@ -423,9 +421,9 @@ class _Live:
         empty = boxes.narrow(a, newest + 1, sorted({newest + 1} | {k + 1 for k in done}))
         if empty is not None:
             names = (_names(model.names.x, "x", model.nx), _names(model.names.y, "y", model.ny))
-            self.empty = conflict_of(rows, *given, np.array(self.times), empty, names).message
+            self.empty = conflict_of(rows, *given, np.array(times), empty, names).message
             return self._infeasible(self.empty)
-        self.lo, self.hi = boxes.lo, boxes.hi
+        self.rows, self.times, self.seen, self.lo, self.hi = rows, times, seen, boxes.lo, boxes.hi
         state = wanted + 1
         box = Box(self.lo[state : state + 1].copy(), self.hi[state : state + 1].copy(), guaranteed=True)
         when = np.array([self.times[wanted]])
