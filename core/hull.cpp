@@ -80,7 +80,6 @@ int hull_sweep(HullSweep& sweep, int from, const HullSettings& set, int longest,
     task.c = c;
     task.k = k;
     task.costs = sides;
-    task.sweeps = 1;
     for (int one = from; one < sweep.tasks; one++) {
         const int a = sweep.a[one], b = sweep.b[one], at = sweep.k[one] - a;
         const std::ptrdiff_t first = std::ptrdiff_t(a) * n, count = std::ptrdiff_t(b - a + 1) * n;
@@ -100,20 +99,26 @@ int hull_sweep(HullSweep& sweep, int from, const HullSettings& set, int longest,
         win.hi = task.hi;
         for (std::ptrdiff_t i = 0; i < count; i++) task.lo[i] = sweep.lo[first + i], task.hi[i] = sweep.hi[first + i];
         for (int p = 0; p < sides; p++) k[p] = at;
-        if (hull_run(task, set, rest)) return one;
-        for (std::ptrdiff_t i = 0; i < count; i++)
-            if (!finite(task.lo[i]) || !finite(task.hi[i])) return one;
         double *lo = task.lo + std::ptrdiff_t(at) * n, *hi = task.hi + std::ptrdiff_t(at) * n;
-        for (int j = 0; j < n; j++) {
-            const double upper = task.bound[j], lower = -task.bound[n + j];
-            if (!(lower <= upper)) return one;
-            lo[j] = max2(lo[j], lower);
-            hi[j] = min2(hi[j], upper);
-            if (!(lo[j] <= hi[j])) return one;
-            const double slack = sweep.loose * (hi[j] - lo[j]) + sweep.least * largest_of(lo[j], hi[j]);
-            if (!(size_of(task.bound[j] - task.value[j]) <= slack)) return one;
-            if (!(size_of(task.bound[n + j] - task.value[n + j]) <= slack)) return one;
+        bool tight = false;
+        for (int round = 0; round < 3 && !tight; round++) {  // once more from the narrower box
+            task.sweeps = round == 0;
+            if (hull_run(task, set, rest)) return one;
+            for (std::ptrdiff_t i = 0; i < count && round == 0; i++)
+                if (!finite(task.lo[i]) || !finite(task.hi[i])) return one;
+            tight = true;
+            for (int j = 0; j < n; j++) {
+                const double upper = task.bound[j], lower = -task.bound[n + j];
+                if (!(lower <= upper)) return one;
+                lo[j] = max2(lo[j], lower);
+                hi[j] = min2(hi[j], upper);
+                if (!(lo[j] <= hi[j])) return one;
+                const double slack = sweep.loose * (hi[j] - lo[j]) + sweep.least * largest_of(lo[j], hi[j]);
+                tight = tight && size_of(task.bound[j] - task.value[j]) <= slack;
+                tight = tight && size_of(task.bound[n + j] - task.value[n + j]) <= slack;
+            }
         }
+        if (!tight) return one;
         for (std::ptrdiff_t i = 0; i < count; i++) {
             sweep.lo[first + i] = max2(sweep.lo[first + i], task.lo[i]);
             sweep.hi[first + i] = min2(sweep.hi[first + i], task.hi[i]);

@@ -136,6 +136,13 @@ class Rows:
         mid = low if high is None else 0.5 * (low + high)
         return np.broadcast_to(mid, (self.T, *mid.shape[-2:]))
 
+    def radius(self, name: str) -> Array:
+        """Return how far the entries of E, A or C (T, ., .) may be from their middles."""
+        low, high, mid = getattr(self, f"{name}_lo"), getattr(self, f"{name}_hi"), self.middle(name)
+        if high is None:
+            return np.zeros_like(mid)
+        return np.where(low == high, 0.0, np.maximum(up(high - mid), up(mid - low)))
+
 
 def interval_rows(model: Linear, record: Record) -> Rows:
     """Return the rows of a model with known uniform noise over a record."""

@@ -191,6 +191,8 @@ class Boxes:
         """Try to give every state of a window a finite box: by contraction, then by a left inverse of its rows."""
         if np.isfinite(self.lo[a : b + 1]).all() and np.isfinite(self.hi[a : b + 1]).all():
             return None
+        states = far_back(self.rows.nx)
+        a = max(0, min(a, b - states))  # rows before the window may say what those in it do not
         for again in (True, False):
             part = self.rows.part(a, b)
             lo, hi, bad = _core.box_contract(
@@ -203,8 +205,7 @@ class Boxes:
             self.lo[a : b + 1], self.hi[a : b + 1] = lo, hi
             if not again or (np.isfinite(lo).all() and np.isfinite(hi).all()):
                 return None
-            states = min(b - a, max(1, _DENSE // self.rows.nx))
-            for first in (b - states, b - states + 1):
+            for first in (max(a, b - states), max(a, b - states) + 1):
                 if first <= b and self._enclose(first, b):
                     break
         return None
@@ -213,9 +214,17 @@ class Boxes:
         """Bound the states a to b by a left inverse Y of their rows; say whether that worked.
 
         With Y M = I - R, |x| <= |Y b| + |R| |x|, so that |x| <= g / (1 - |R|) in the largest norm. R and the products
-        are computed with a bound of their rounding, (N + 2) eps times the sums of absolute values.
+        are computed with a bound of their rounding; an interval entry of M adds |Y| times its radius to R.
         """
-        M, low, high = dense_rows(self.rows.part(a, b), self.lo[a : b + 1], self.hi[a : b + 1])
+        rows, box_lo, box_hi = self.rows.part(a, b), self.lo[a : b + 1].ravel(), self.hi[a : b + 1].ravel()
+        M, low, high = sparse_rows(rows)
+        box, there = np.isfinite(box_lo) & np.isfinite(box_hi), np.isfinite(low) & np.isfinite(high)
+        M = np.concatenate((np.eye(box.size)[box], M.toarray()[there]))
+        low, high = np.concatenate((box_lo[box], low[there])), np.concatenate((box_hi[box], high[there]))
+        radius = np.zeros_like(M)
+        if rows.A_hi is not None or rows.C_hi is not None or rows.E_hi is not None:
+            off = _sparse(rows.radius("A"), rows.radius("E"), rows.radius("C")).toarray()
+            radius[int(box.sum()) :] = off[there]
         size = M.shape[1]
         if len(M) < size:
             return False
@@ -223,7 +232,8 @@ class Boxes:
         scale = np.where(scale > 0, scale, 1.0)
         Y = np.linalg.pinv(M / scale[:, None]) / scale
         gamma = (len(M) + size + 8) * 4.5e-16
-        R = np.abs(np.eye(size) - Y @ M) + gamma * (np.abs(Y) @ np.abs(M) + np.eye(size)) + 1e-290
+        R = np.abs(np.eye(size) - Y @ M) + np.abs(Y) @ radius * (1.0 + gamma)
+        R = (R + gamma * (np.abs(Y) @ np.abs(M) + np.eye(size)) + 1e-290) * (1.0 + gamma)
         norm = R.sum(axis=1) * (1.0 + gamma)
         if not norm.max() < 0.1:
             return False
@@ -235,6 +245,11 @@ class Boxes:
         self.lo[a : b + 1] = np.maximum(self.lo[a : b + 1], -each)
         self.hi[a : b + 1] = np.minimum(self.hi[a : b + 1], each)
         return True
+
+
+def far_back(nx: int) -> int:
+    """Return how many rows are looked at to bound states of an infinite box."""
+    return max(1, _DENSE // nx)
 
 
 @functools.lru_cache(maxsize=256)
@@ -292,33 +307,26 @@ def stock(ask: Question) -> tuple[Array, Array]:
 
 
 def sparse_rows(rows: Rows) -> tuple[Any, Array, Array]:
-    """Return M (K (nx + ny), (K + 1) nx) as CSR and the ends of its rows, time by time, dynamics first."""
-    import scipy.sparse as sp
+    """Return M (K (nx + ny), (K + 1) nx) as CSR and the ends of its rows, time by time, dynamics first.
 
-    K, nx, ny = rows.T, rows.nx, rows.ny
-    E, A, C = rows.middle("E"), rows.middle("A"), rows.middle("C")
-    t, i, j = (v.ravel() for v in np.meshgrid(range(K), range(nx), range(nx), indexing="ij"))
-    s, o, h = (v.ravel() for v in np.meshgrid(range(K), range(ny), range(nx), indexing="ij"))
-    row = np.concatenate((t * (nx + ny) + i, t * (nx + ny) + i, s * (nx + ny) + nx + o))
-    column = np.concatenate((t * nx + j, (t + 1) * nx + j, (s + 1) * nx + h))
-    value = np.concatenate((-A[t, i, j], E[t, i, j], C[s, o, h]))
-    M = sp.csr_array((value, (row, column)), shape=(K * (nx + ny), (K + 1) * nx))
-    M.eliminate_zeros()
+    Interval entries are taken at their middle.
+    """
+    M = _sparse(-rows.middle("A"), rows.middle("E"), rows.middle("C"))
     low = np.concatenate((rows.bx_lo, rows.by_lo), axis=1).ravel()
     high = np.concatenate((rows.bx_hi, rows.by_hi), axis=1).ravel()
     return M, low, high
 
 
-def dense_rows(rows: Rows, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
-    """Return rows with finite ends, those of finite boxes among them: M (N, (K + 1) nx), low, high.
+def _sparse(A: Array, E: Array, C: Array) -> Any:
+    """Return the chain with A (K, nx, nx) on the states before, E and C (K, ny, nx) on those after, as CSR."""
+    import scipy.sparse as sp
 
-    Interval entries are not expressed: with one, only the boxes are.
-    """
-    size = lo.size
-    box = np.isfinite(lo.ravel()) & np.isfinite(hi.ravel())
-    parts = [(np.eye(size)[box], lo.ravel()[box], hi.ravel()[box])]
-    if rows.A_hi is None and rows.C_hi is None and rows.E_hi is None and rows.T:
-        M, low, high = sparse_rows(rows)
-        there = np.isfinite(low) & np.isfinite(high)
-        parts.append((M.toarray()[there], low[there], high[there]))
-    return tuple(np.concatenate(p) for p in zip(*parts, strict=True))  # type: ignore[return-value]
+    K, ny, nx = C.shape
+    t, i, j = (v.ravel() for v in np.meshgrid(np.arange(K), np.arange(nx), np.arange(nx), indexing="ij"))
+    s, o, h = (v.ravel() for v in np.meshgrid(np.arange(K), np.arange(ny), np.arange(nx), indexing="ij"))
+    row = np.concatenate((t * (nx + ny) + i, t * (nx + ny) + i, s * (nx + ny) + nx + o))
+    column = np.concatenate((t * nx + j, (t + 1) * nx + j, (s + 1) * nx + h))
+    value = np.concatenate((A[t, i, j], E[t, i, j], C[s, o, h]))
+    M = sp.csr_array((value, (row, column)), shape=(K * (nx + ny), (K + 1) * nx))
+    M.eliminate_zeros()
+    return M

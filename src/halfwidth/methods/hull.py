@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from halfwidth.array import Array, of_size, real
 from halfwidth.errors import BadShape, BadValue, Refused
 from halfwidth.methods._bounds import Rows, ends_of, interval_rows, rows_of, theta_ends
-from halfwidth.methods._boxes import Boxes, Empty, Proposer, stock
+from halfwidth.methods._boxes import Boxes, Empty, Proposer, far_back, stock
 from halfwidth.methods._conflict import Conflict, conflict_of
 from halfwidth.methods._protocol import pushed_row, typed
 from halfwidth.methods.window import window_starts
@@ -467,7 +467,9 @@ class _Live:
         return window_starts(seen, memory, fixes=_FIXES, stretch=memory * _STRETCH)
 
     def _forget(self, a: int) -> None:
-        """Drop what lies before the window: starts never move back."""
+        """Drop what lies before the window: starts never move back, but for states without a bound."""
+        if not (np.isfinite(self.lo[a:]).all() and np.isfinite(self.hi[a:]).all()):
+            a = min(a, max(0, len(self.times) - far_back(self.model.nx)))
         if a > 0 and self.rows is not None:
             self.rows = self.rows.part(a, self.rows.T)
             self.lo, self.hi, self.seen = self.lo[a:], self.hi[a:], self.seen[a:]
