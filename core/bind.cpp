@@ -13,6 +13,9 @@ void bind_lp(nb::module_& m);
 void bind_chain(nb::module_& m);
 void bind_box(nb::module_& m);
 void bind_hull(nb::module_& m);
+void bind_constrain(nb::module_& m);
+void bind_noise(nb::module_& m);
+void bind_sampler(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -28,4 +31,7 @@ NB_MODULE(_core, m) {
     bind_chain(m);
     bind_box(m);
     bind_hull(m);
+    bind_constrain(m);
+    bind_noise(m);
+    bind_sampler(m);
 }
