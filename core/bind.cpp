@@ -11,6 +11,8 @@ void bind_nonlinear(nb::module_& m);
 void bind_loss(nb::module_& m);
 void bind_lp(nb::module_& m);
 void bind_chain(nb::module_& m);
+void bind_box(nb::module_& m);
+void bind_hull(nb::module_& m);
 void bind_constrain(nb::module_& m);
 void bind_noise(nb::module_& m);
 void bind_sampler(nb::module_& m);
@@ -28,6 +30,8 @@ NB_MODULE(_core, m) {
     bind_loss(m);
     bind_lp(m);
     bind_chain(m);
+    bind_box(m);
+    bind_hull(m);
     bind_constrain(m);
     bind_noise(m);
     bind_sampler(m);
