@@ -11,6 +11,7 @@ void bind_nonlinear(nb::module_& m);
 void bind_loss(nb::module_& m);
 void bind_lp(nb::module_& m);
 void bind_chain(nb::module_& m);
+void bind_enclose(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -24,4 +25,5 @@ NB_MODULE(_core, m) {
     bind_loss(m);
     bind_lp(m);
     bind_chain(m);
+    bind_enclose(m);
 }
