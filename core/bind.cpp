@@ -12,6 +12,7 @@ void bind_loss(nb::module_& m);
 void bind_lp(nb::module_& m);
 void bind_chain(nb::module_& m);
 void bind_enclose(nb::module_& m);
+void bind_box(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -26,4 +27,5 @@ NB_MODULE(_core, m) {
     bind_lp(m);
     bind_chain(m);
     bind_enclose(m);
+    bind_box(m);
 }
