@@ -12,6 +12,7 @@ void bind_loss(nb::module_& m);
 void bind_lp(nb::module_& m);
 void bind_chain(nb::module_& m);
 void bind_enclose(nb::module_& m);
+void bind_sets(nb::module_& m);
 void bind_box(nb::module_& m);
 
 NB_MODULE(_core, m) {
@@ -27,5 +28,6 @@ NB_MODULE(_core, m) {
     bind_lp(m);
     bind_chain(m);
     bind_enclose(m);
+    bind_sets(m);
     bind_box(m);
 }

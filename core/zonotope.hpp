@@ -76,8 +76,8 @@ struct Zonotope {
         return 2 + z.n + std::size_t(z.n + rows(z)) * columns(z) + 2 * std::size_t(rows(z));
     }
     static std::size_t work(const SetSizes& z) {
-        const std::size_t w = columns(z), k = rows(z);
-        return z.n * w + 4 * z.n + 3 * w + (k + 8) * (w + k + 8) + 6 * (w + k);
+        const std::size_t w = columns(z) + 4, k = rows(z);
+        return z.n * w + 4 * z.n + 3 * w + k * w + 7 * w + 5 * k;
     }
     Zonotope(const SetSizes& z, double* s, double* w)
         : n(z.n), most(z.generators), rows_most(z.kind == SetKind::constrained ? z.constraints : 0), cap(columns(z)), rows_cap(rows(z)) {
@@ -348,111 +348,141 @@ struct Zonotope {
     // ---- dual simplex on max g xi, A xi + sigma = b, |xi| <= 1, |sigma| <= t --------------------------------------------
     // x_B = beta - T x_N; basic and nonbasic variables by number, xi first. A nonbasic variable stands at the end of its
     // range that its reduced cost d prefers, which is dual feasible in any basis, so each programme starts where the last ended.
+    // Rows are padded with zeros to whole vectors.
 
     struct Tableau {
-        double *T, *beta, *d, *at, *value, *cost, *y;
-        double *basic, *free;
+        double *T, *beta, *d, *at, *range, *limit, *cost, *y, *step;
+        int *basic, *free, *turn;
     };
-    Tableau tableau() {
-        const std::size_t w = cap, k = rows_cap;
+    static int padded(int k) { return (k + 3) & ~3; }
+    Tableau tableau() const {
+        const std::size_t w = padded(cap), k = rows_cap;
         Tableau q;
         q.T = lp;
         q.beta = q.T + k * w;
-        q.d = q.beta + k;
+        q.limit = q.beta + k;
+        q.y = q.limit + k;
+        q.d = q.y + k;
         q.at = q.d + w;
-        q.value = q.at + w;
-        q.cost = q.value + k;
-        q.y = q.cost + w + k;
-        q.basic = q.y + k;
+        q.range = q.at + w;
+        q.step = q.range + w;
+        q.cost = q.step + w;
+        q.basic = reinterpret_cast<int*>(q.cost + w + k);
         q.free = q.basic + k;
+        q.turn = q.free + w;
         return q;
     }
     void open() {
         const Tableau q = tableau();
-        const int k = generators(), rows = constraints();
+        const int k = generators(), rows = constraints(), w = padded(cap), pad = padded(k);
         for (int l = 0; l < rows; l++) {
-            for (int j = 0; j < k; j++) q.T[std::size_t(l) * cap + j] = A[std::size_t(l) * cap + j];
+            for (int j = 0; j < pad; j++) q.T[std::size_t(l) * w + j] = j < k ? A[std::size_t(l) * cap + j] : 0.0;
             q.beta[l] = b[l];
+            q.limit[l] = t[l];
             q.basic[l] = k + l;
         }
-        for (int j = 0; j < k; j++) q.free[j] = j;
+        for (int j = 0; j < pad; j++) {
+            q.free[j] = j < k ? j : 0;
+            q.range[j] = j < k ? 1.0 : 0.0;
+            q.d[j] = q.at[j] = 0.0;
+        }
     }
-    double range(int variable, int k) const { return variable < k ? 1.0 : t[variable - k]; }
+    // a . b and a . a of padded rows
+    static void products(int k, const double* a, const double* b, double& ab, double& aa) {
+        V4 s{}, z{};
+        for (int j = 0; j < k; j += 4) {
+            const V4 x = *reinterpret_cast<const V4u*>(a + j);
+            s += x * *reinterpret_cast<const V4u*>(b + j);
+            z += x * x;
+        }
+        ab = (s[0] + s[1]) + (s[2] + s[3]);
+        aa = (z[0] + z[1]) + (z[2] + z[3]);
+    }
+    static void subtract(int k, double f, const double* a, double* out) {
+        for (int j = 0; j < k; j += 4) *reinterpret_cast<V4u*>(out + j) -= f * *reinterpret_cast<const V4u*>(a + j);
+    }
 
     // a safe bound on max s g xi
     double most_of(const double* objective, double s, bool& feasible) {
         const Tableau q = tableau();
-        const int k = generators(), rows = constraints();
+        const int k = generators(), rows = constraints(), w = padded(cap), pad = padded(k);
         for (int j = 0; j < k; j++) q.cost[j] = s * objective[j];
         for (int l = 0; l < rows; l++) q.cost[k + l] = 0.0;
-        for (int j = 0; j < k; j++) q.d[j] = q.cost[int(q.free[j])];
-        for (int l = 0; l < rows; l++) {
-            const double of_basic = q.cost[int(q.basic[l])];
-            if (of_basic != 0.0)
-                for (int j = 0; j < k; j++) q.d[j] -= of_basic * q.T[std::size_t(l) * cap + j];
-        }
-        for (int j = 0; j < k; j++) q.at[j] = (q.d[j] > 0.0 ? 1.0 : -1.0) * range(int(q.free[j]), k);
+        for (int j = 0; j < k; j++) q.d[j] = q.cost[q.free[j]];
+        for (int l = 0; l < rows; l++)
+            if (q.cost[q.basic[l]] != 0.0) subtract(pad, q.cost[q.basic[l]], q.T + std::size_t(l) * w, q.d);
+        for (int j = 0; j < k; j++) q.at[j] = q.d[j] > 0.0 ? q.range[j] : -q.range[j];
         for (int round = 0; round < 3 * rows + 8; round++) {
             int out = -1;
-            double worst = 1e-10, side = 1.0;
+            double worst = 0.0, side = 1.0, slope = 0.0;
             for (int l = 0; l < rows; l++) {
-                const double* row = q.T + std::size_t(l) * cap;
-                double v = q.beta[l];
-                for (int j = 0; j < k; j++) v -= row[j] * q.at[j];
-                q.value[l] = v;
-                const double over = size_of(v) - range(int(q.basic[l]), k);
-                if (over > worst) worst = over, out = l, side = v > 0.0 ? 1.0 : -1.0;
+                double p, size;
+                products(pad, q.T + std::size_t(l) * w, q.at, p, size);
+                const double v = q.beta[l] - p, over = size_of(v) - q.limit[l];
+                // steepest edge: violation by the length of its row
+                if (over > 1e-10 && over * over > worst * (1.0 + size)) {
+                    worst = over * over / (1.0 + size);
+                    out = l, slope = over, side = v > 0.0 ? 1.0 : -1.0;
+                }
             }
             if (out < 0) break;
-            double* row = q.T + std::size_t(out) * cap;
-            // walk along the breakpoints until the slope turns
-            double slope = worst, largest_entry = 0.0;
-            for (int j = 0; j < k; j++) largest_entry = max2(largest_entry, size_of(row[j]));
-            const double least_pivot = 1e-9 * largest_entry;
-            int in = -1;
-            for (int passed = 0; passed <= k; passed++) {
-                double best = inf;
-                int next = -1;
-                for (int j = 0; j < k; j++) {
-                    const double a = side * row[j];
-                    if (size_of(a) <= least_pivot || (q.at[j] < 0.0) != (a > 0.0)) continue;
-                    if (range(int(q.free[j]), k) == 0.0) continue;  // no end to flip to: d may have either sign
-                    const double ratio = size_of(q.d[j] / a);
-                    if (ratio < best) best = ratio, next = j;
+            double* row = q.T + std::size_t(out) * w;
+            // where reduced costs change sign; pass these points in order until the slope turns
+            double tall = 0.0;
+            for (int j = 0; j < k; j++) tall = max2(tall, size_of(row[j]));
+            int points = 0, in = -1;
+            for (int j = 0; j < k; j++) {
+                const double a = side * row[j];
+                // a variable without a range has no end to flip to, and d of either sign
+                if (a * q.at[j] < 0.0 && size_of(a) > 1e-9 * tall) {
+                    q.turn[points] = j;
+                    q.step[points++] = size_of(q.d[j] / a);
                 }
-                if (next < 0) break;
-                slope -= 2.0 * size_of(row[next]) * range(int(q.free[next]), k);
-                in = next;
-                if (slope <= 0.0) break;
-                q.at[next] = -q.at[next];
-                in = -1;
+            }
+            while (points > 0) {
+                int next = 0;
+                for (int p = 1; p < points; p++) next = q.step[p] < q.step[next] ? p : next;
+                const int j = q.turn[next];
+                slope -= 2.0 * size_of(row[j]) * q.range[j];
+                if (slope <= 0.0) {
+                    in = j;
+                    break;
+                }
+                q.at[j] = -q.at[j];
+                points--;
+                q.turn[next] = q.turn[points];
+                q.step[next] = q.step[points];
             }
             if (in < 0) {
                 if (empty(q, out)) feasible = false;
                 break;
             }
-            const double pivot = row[in], left = side * range(int(q.basic[out]), k);
-            for (int j = 0; j < k; j++) row[j] = j == in ? 1.0 / pivot : row[j] / pivot;
-            q.beta[out] /= pivot;
+            const double inverse = 1.0 / row[in];
+            row[in] = 1.0;
+            for (int j = 0; j < pad; j++) row[j] *= inverse;
+            q.beta[out] *= inverse;
             for (int l = 0; l < rows; l++) {
-                double* other = q.T + std::size_t(l) * cap;
+                double* other = q.T + std::size_t(l) * w;
                 const double f = other[in];
                 if (l == out || f == 0.0) continue;
                 other[in] = 0.0;
-                for (int j = 0; j < k; j++) other[j] -= f * row[j];
+                subtract(pad, f, row, other);
                 q.beta[l] -= f * q.beta[out];
             }
             const double f = q.d[in];
             q.d[in] = 0.0;
-            for (int j = 0; j < k; j++) q.d[j] -= f * row[j];
-            const double entered = q.free[in];
+            subtract(pad, f, row, q.d);
+            const int entered = q.free[in];
+            const double entered_range = q.range[in];
             q.free[in] = q.basic[out];
+            q.range[in] = q.limit[out];
+            q.at[in] = side * q.limit[out];
             q.basic[out] = entered;
-            q.at[in] = left;
+            q.limit[out] = entered_range;
         }
         for (int l = 0; l < rows; l++) q.y[l] = 0.0;
         for (int j = 0; j < k; j++)
-            if (int(q.free[j]) >= k) q.y[int(q.free[j]) - k] = -q.d[j];
+            if (q.free[j] >= k) q.y[q.free[j] - k] = -q.d[j];
         return feasible ? bound(q.cost, q.y) : inf;
     }
 
@@ -479,11 +509,11 @@ struct Zonotope {
     // whether row `out` of the tableau proves that no xi fits
     bool empty(const Tableau& q, int out) {
         const int k = generators(), rows = constraints();
-        const double* row = q.T + std::size_t(out) * cap;
+        const double* row = q.T + std::size_t(out) * padded(cap);
         for (int l = 0; l < rows; l++) q.y[l] = 0.0;
         for (int j = 0; j < k; j++)
-            if (int(q.free[j]) >= k) q.y[int(q.free[j]) - k] = row[j];
-        if (int(q.basic[out]) >= k) q.y[int(q.basic[out]) - k] = 1.0;
+            if (q.free[j] >= k) q.y[q.free[j] - k] = row[j];
+        if (q.basic[out] >= k) q.y[q.basic[out] - k] = 1.0;
         for (int j = 0; j < k; j++) q.cost[j] = 0.0;
         if (bound(q.cost, q.y) < 0.0) return true;
         for (int l = 0; l < rows; l++) q.y[l] = -q.y[l];
