@@ -26,6 +26,27 @@ namespace HW_ISA {
 // What rounding can do to a sum of k terms, each a product of a few factors, whose absolute values add up to s.
 inline double slack(int k, double s) { return (2 * k + 8) * eps * s + k * 1e-321; }
 
+// Sums in whole vectors and a tail: the order of a sum is no matter where its rounding is bounded
+inline double sum_abs(int k, const double* a) {
+    V4 s{};
+    int j = 0;
+    for (; j + 4 <= k; j += 4) {
+        const V4 x = *reinterpret_cast<const V4u*>(a + j);
+        s += x < 0.0 ? -x : x;
+    }
+    double total = (s[0] + s[1]) + (s[2] + s[3]);
+    for (; j < k; j++) total += size_of(a[j]);
+    return total;
+}
+inline double product(int k, const double* a, const double* b) {
+    V4 s{};
+    int j = 0;
+    for (; j + 4 <= k; j += 4) s += *reinterpret_cast<const V4u*>(a + j) * *reinterpret_cast<const V4u*>(b + j);
+    double total = (s[0] + s[1]) + (s[2] + s[3]);
+    for (; j < k; j++) total += a[j] * b[j];
+    return total;
+}
+
 struct Coefficient {
     double mid, rad;
 };
@@ -110,8 +131,7 @@ struct Zonotope {
     // sum_j |G_ij|, rounded up
     double row_sum(const double* row) const {
         const int k = generators();
-        double s = 0.0;
-        for (int j = 0; j < k; j++) s += size_of(row[j]);
+        const double s = sum_abs(k, row);
         return s + slack(k, s);
     }
 
@@ -144,8 +164,7 @@ struct Zonotope {
             // the noise of the row, and all that rounding and unknown entries did to it: one generator
             row[k + i] = up(up(shift.rad + q.unknown(i)) + slack(2 * n + 1, size));
             fresh_c[i] = centre;
-            double s = size_of(centre);
-            for (int j = 0; j < k + n; j++) s += size_of(row[j]);
+            const double s = size_of(centre) + sum_abs(k + n, row);
             fresh_sum[i] = s + slack(k + n, s);
         }
         for (int i = 0; i < n; i++) {
@@ -172,8 +191,7 @@ struct Zonotope {
             size += size_of(h[l]) * (size_of(c[l]) + sum[l]);
             far += size_of(h[l]) * rest[l];
         }
-        double s = 0.0;
-        for (int j = 0; j < k; j++) s += size_of(g[j]);
+        const double s = sum_abs(k, g);
         rounding = slack(n, size);
         carried = far > 0.0 ? up(far + slack(n, far)) : 0.0;
         half = up(up(s + slack(k, s)) + up(carried + rounding));
@@ -195,19 +213,10 @@ struct Zonotope {
     // x + K (z - h x - r eta)
     Strip gain(const Coefficient& strip, double middle, double rounding) {
         const int k = generators();
-        double S = strip.rad * strip.rad, size = 0.0;
-        for (int j = 0; j < k; j++) {
-            S += g[j] * g[j];
-            size += size_of(g[j]);
-        }
+        const double S = strip.rad * strip.rad + product(k, g, g), size = sum_abs(k, g);
         if (!(S > 0.0) || !finite(S)) return Strip::idle;
         const double step = strip.mid - middle, off = slack(2, size_of(strip.mid) + size_of(middle)) + 2.0 * rounding;
-        for (int i = 0; i < n; i++) {
-            double p = 0.0;
-            const double* row = G + std::size_t(i) * cap;
-            for (int j = 0; j < k; j++) p += row[j] * g[j];
-            K[i] = p / S;
-        }
+        for (int i = 0; i < n; i++) K[i] = product(k, G + std::size_t(i) * cap, g) / S;
         for (int i = 0; i < n; i++) {
             double* row = G + std::size_t(i) * cap;
             const double gain = K[i];
@@ -243,21 +252,12 @@ struct Zonotope {
     // The oldest constraint, A_0 xi = b_0 + t_0 eta, becomes a generator: L times it is added to each row of G and A.
     void absorb() {
         const int k = generators(), last = constraints() - 1;
-        double S = t[0] * t[0], size = size_of(b[0]) + t[0];
-        for (int j = 0; j < k; j++) {
-            S += A[j] * A[j];
-            size += size_of(A[j]);
-        }
+        const double S = t[0] * t[0] + product(k, A, A), size = size_of(b[0]) + t[0] + sum_abs(k, A);
         for (int i = 0; i < n + last; i++) {
             const bool state = i < n;
             const int l = i - n + 1;
             double* row = state ? G + std::size_t(i) * cap : A + std::size_t(l) * cap;
-            double p = 0.0, own = 0.0;
-            for (int j = 0; j < k; j++) {
-                p += row[j] * A[j];
-                own += size_of(row[j]);
-            }
-            const double L = S > 0.0 ? p / S : 0.0;
+            const double own = sum_abs(k, row), L = S > 0.0 ? product(k, row, A) / S : 0.0;
             for (int j = 0; j < k; j++) row[j] -= L * A[j];
             row[k] = L * t[0];
             const double off = slack(4, own + size_of(state ? c[i] : b[l]) + size_of(L) * size);
@@ -502,8 +502,7 @@ struct Zonotope {
             total += y[l] * b[l] + s * t[l];
             size += s * (size_of(b[l]) + t[l]);
         }
-        for (int j = 0; j < k; j++) total += size_of(g[j]), size += score[j];
-        return up(total + slack(k + rows + 4, size));
+        return up(total + sum_abs(k, g) + slack(k + rows + 4, size + sum_abs(k, score)));
     }
 
     // whether row `out` of the tableau proves that no xi fits

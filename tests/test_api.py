@@ -7,11 +7,12 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud DataQualityWarning Estimate
-Estimator ExtendedKalman FearnheadClifford GPB Gaussian HalfwidthError KalmanFilter KalmanSmoother Learned Linear
-LogTooBig Markov MemoryChoice Missing Mixed Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls
-SequentialLP Status Uniform UnscentedKalman Unsolved Window __version__ choose_memory ensemble_interval estimate
-forecast from_continuous learn resume score simulate stream
+BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud ConstrainedZonotopeFilter
+DataQualityWarning EllipsoidFilter Estimate Estimator ExtendedKalman FearnheadClifford GPB Gaussian HalfwidthError
+IntervalFilter KalmanFilter KalmanSmoother Learned Linear LogTooBig Markov MemoryChoice Missing Mixed Nonlinear Normal
+ParticleFilter RBPF Record Recursive Refused Runnalls SequentialLP Status Uniform UnscentedKalman Unsolved Window
+ZonotopeFilter __version__ choose_memory ensemble_interval estimate forecast from_continuous learn resume score
+simulate stream
 """
 
 

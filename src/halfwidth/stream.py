@@ -203,6 +203,9 @@ class _Stepped:
         self.state = self.method.step(model, self.state, row, inputs, self.t + step, step)
         self.t += step
         self.pushed += 1
+        answer = getattr(self.method, "answer", None)
+        if answer is not None:
+            return answer(model, self.state, self.t)  # type: ignore[no-any-return]
         x, P, loglik = self.method.belief(model, self.state)
         newest: Estimate = object.__new__(self.kind)
         code = 0 if np.isfinite(x).all() else 3

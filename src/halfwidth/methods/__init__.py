@@ -20,6 +20,10 @@ ESTIMATORS: dict[str, str] = {
     "BatchLP": "map",
     "SequentialLP": "sequential",
     "Window": "window",
+    "IntervalFilter": "sets",
+    "ZonotopeFilter": "sets",
+    "ConstrainedZonotopeFilter": "sets",
+    "EllipsoidFilter": "sets",
 }
 
 

@@ -1,0 +1,368 @@
+"""Cheap sets that contain the state: interval, zonotope, constrained zonotope and ellipsoid recursions.
+
+For noise of known half-widths and a box as prior, each row moves a set through the dynamics, adds what the noise can do
+and cuts it with the seen outputs. `IntervalFilter` keeps a box and contracts it forwards and backwards over the newest
+step [1]_; `ZonotopeFilter` keeps generators and the gain that makes them least [2]_; `ConstrainedZonotopeFilter` also
+keeps the newest outputs as constraints, and is exact but for what it forgets [3]_; `EllipsoidFilter` keeps a centre
+and a matrix [4]_. The box runs beside each of the others and both tighten each other, so their answers lie inside that
+of `IntervalFilter`; all lie around the exact hull.
+
+Rounding is accounted for, so the boxes contain in floating point. A row that contradicts the rows before it is named,
+the status is INFEASIBLE, and from there on nothing is claimed. Nonlinear models are taken where `g` and `h` can be
+recorded: over the newest box they are replaced by affine functions with a proved distance, which widens the noise
+(`halfwidth.enclosure`). Unknown entries of A, B, C, E within finite ``theta_bounds`` make an interval matrix.
+
+References
+----------
+.. [1] Jaulin, Kieffer, Didrit and Walter (2001), Applied Interval Analysis; Benhamou et al. (1999), ICLP.
+.. [2] Combastel (2015), Automatica 55; Alamo, Bravo and Camacho (2005), Automatica 41.
+.. [3] Scott, Raimondo, Marseglia and Braatz (2016), Automatica 69.
+.. [4] Schweppe (1968), IEEE TAC 13; Fogel and Huang (1982), Automatica 18.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+import halfwidth._core as _core
+from halfwidth.array import Array
+from halfwidth.enclosure import affine
+from halfwidth.errors import BadValue, Refused, hinted
+from halfwidth.methods import _bounded
+from halfwidth.methods._bounded import Rows, grown, linear_rows
+from halfwidth.methods._protocol import typed
+from halfwidth.model import Linear, Model, Nonlinear, arity
+from halfwidth.noise import Uniform
+from halfwidth.record import Record
+from halfwidth.result import Estimate, Status
+from halfwidth.spread import Box
+from halfwidth.trace import Tape, Untraceable, compiled
+
+_TURN = 2.0 * np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class SetState:
+    """What a set recursion remembers between rows.
+
+    Parameters
+    ----------
+    lo, hi : (nx,) arrays
+        Box of the newest state; infinite where nothing is known.
+    x : (nx,) array
+        Its middle.
+    shape : array
+        The kernel's own numbers.
+    rows : int
+        Rows taken so far.
+    conflict : int
+        0, or 1 + the number of the first row that contradicts those before it.
+    which : int
+        Which of its nx + ny equations, states first.
+    """
+
+    lo: Array
+    hi: Array
+    x: Array
+    shape: Array
+    rows: int
+    conflict: int
+    which: int
+
+
+class _Recursion:
+    """The recursion that all sets share; the kind of set is the kernel's business."""
+
+    def refuses(self, model: Model) -> str | None:
+        """Return why the model cannot be taken, or None."""
+        reason = _bounded.refuses(model, type(self).__name__)
+        if reason is None and isinstance(model, Nonlinear):
+            why = _tapes(model)
+            if isinstance(why, str):
+                return (
+                    f"`{type(self).__name__}` needs `g` and `h` written with functions of NumPy but {why}\n"
+                    "hint: np.sin rather than math.sin; `ParticleFilter()` takes any function, without a guarantee"
+                )
+        return reason
+
+    def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
+        """Enclose the state at every row, from the rows up to it."""
+        state = self.init(model)
+        dt = record.steps(model.dt)
+        if isinstance(model, Linear):
+            rows = linear_rows(model, record.t, dt, record.y, record.u)
+            state, lo, hi, x = self._advance(model, state, rows)
+        else:
+            lo, hi, x = (np.empty((len(record), model.nx)) for _ in range(3))
+            for k in range(len(record)):
+                u = None if record.u is None else record.u[k]
+                state = self.step(model, state, record.y[k], u, float(record.t[k]), float(dt[k]))
+                lo[k], hi[k], x[k] = state.lo, state.hi, state.x
+        return self._estimate(model, state, record.t, lo, hi, x, replace_labels=record)
+
+    def init(self, model: Model) -> SetState:
+        """Return the set one step before the first row."""
+        reason = self.refuses(model)
+        if reason is not None:
+            message, hint = hinted(reason)
+            raise Refused(message, hint=hint)
+        assert isinstance(model.x0, Box)
+        kind, generators, constraints = self._sizes(model)
+        shape = _core.sets_start(kind, model.nx, model.ny, generators, constraints)
+        return SetState(model.x0.lo, model.x0.hi, model.x0.mean, shape, 0, 0, 0)
+
+    def step(self, model: Model, state: SetState, y: Array, u: Array | None, t: float, dt: float) -> SetState:
+        """Return the set after one row; NaN in `y` is missing."""
+        outputs = np.asarray(y, dtype=np.float64).reshape(1, model.ny)
+        inputs = None if u is None else np.asarray(u, dtype=np.float64).reshape(1, model.nu)
+        if isinstance(model, Linear):
+            rows = linear_rows(model, np.array([t]), np.array([dt]), outputs, inputs, first=state.rows)
+            return self._advance(model, state, rows)[0]
+        return self._nonlinear(model, state, outputs, inputs, dt)
+
+    def answer(self, model: Model, state: SetState, t: float) -> Estimate:
+        """Return the estimate of the newest row, for a stream."""
+        return self._estimate(model, state, np.array([t]), state.lo[None], state.hi[None], state.x[None])
+
+    def _sizes(self, model: Model) -> tuple[str, int, int]:
+        """Return kind of set, most generators and most constraints."""
+        raise NotImplementedError
+
+    def _advance(
+        self, model: Model, state: SetState, rows: Rows, inside: tuple[Array, Array] | None = None
+    ) -> tuple[SetState, Array, Array, Array]:
+        """Run the kernel over some rows: the state after them, and boxes and points of each; `inside` bounds them all."""
+        kind, generators, constraints = self._sizes(model)
+        if inside is None and model.bounds is not None:
+            inside = model.bounds.lo, model.bounds.hi
+        low, high = (None, None) if inside is None else inside
+        lo, hi, x, shape, code = _core.sets_run(
+            kind, rows.E, rows.A, rows.C, rows.bx_lo, rows.bx_hi, rows.by_lo, rows.by_hi, state.lo, state.hi, state.x,
+            state.shape, generators, constraints, low, high, rows.E_hi, rows.A_hi, rows.C_hi,
+        )  # fmt: skip
+        conflict, which = state.conflict, state.which
+        if code and not conflict:
+            row, which = divmod(code - 1, model.nx + model.ny)
+            conflict = state.rows + row + 1
+        new = SetState(lo[-1], hi[-1], x[-1], shape, state.rows + len(rows.bx_lo), conflict, which)
+        return new, lo[1:], hi[1:], x[1:]
+
+    def _nonlinear(self, model: Nonlinear, state: SetState, y: Array, u: Array | None, dt: float) -> SetState:
+        """One row of a nonlinear model: affine over the box before it, the outputs over the box after it."""
+        tapes = _tapes(model)
+        assert not isinstance(tapes, str)
+        assert isinstance(model.w, Uniform)
+        assert isinstance(model.e, Uniform)
+        more = (None if u is None else u[0], dt)[: arity(model.g, 3) - 1]
+        g = affine(tapes.g, state.lo, state.hi, *more)
+        with np.errstate(invalid="ignore"):
+            half = np.nextafter(g.half + model.w.q, np.inf)
+            rows = Rows(None, g.J, np.zeros((0, model.nx)), *(b[None] for b in grown(g.k, g.k, half)), *2 * (np.zeros((1, 0)),))
+        inside = grown(g.lo, g.hi, model.w.q)
+        if model.bounds is not None:
+            inside = np.maximum(inside[0], model.bounds.lo), np.minimum(inside[1], model.bounds.hi)
+        # The motion alone says where h is to be enclosed; what the outputs then say is where it is enclosed again.
+        box = _core.sets_run(
+            "interval", None, rows.A, rows.C, rows.bx_lo, rows.bx_hi, rows.by_lo, rows.by_hi, state.lo, state.hi, state.x,
+            _core.sets_start("interval", model.nx, 0), 0, 0, *_ordered(inside),
+        )  # fmt: skip
+        if box[4] or np.any(inside[0] > inside[1]):
+            return self._contradicted(model, state, rows, box[4])
+        inside = box[0][-1], box[1][-1]
+        for last in (False, True):
+            h = affine(tapes.h, *inside)
+            target = _turned(model, y[0], h.lo, h.hi)
+            with np.errstate(invalid="ignore"):
+                half = np.nextafter(h.half + model.e.q, np.inf)
+                by_lo, by_hi = grown(*grown(target, target, np.abs(h.k) * 4e-16 + np.abs(target) * 4e-16), half)
+                by_lo, by_hi = np.nextafter(by_lo - h.k, -np.inf), np.nextafter(by_hi - h.k, np.inf)
+            blind = np.isnan(by_lo) | np.isnan(by_hi)
+            full = replace(rows, C=h.J, by_lo=np.where(blind, -np.inf, by_lo)[None], by_hi=np.where(blind, np.inf, by_hi)[None])
+            new = self._advance(model, state, full, inside)[0]
+            if last or new.conflict > state.rows:
+                return new
+            inside = new.lo, new.hi
+        raise AssertionError
+
+    def _contradicted(self, model: Nonlinear, state: SetState, rows: Rows, code: int) -> SetState:
+        """Return the state after a motion that leaves the bounds."""
+        n = model.nx
+        which = (code - 1) % n if code else 0
+        free = np.full(n, np.inf)
+        kind, generators, constraints = self._sizes(model)
+        shape = _core.sets_start(kind, n, model.ny, generators, constraints)
+        first = not state.conflict
+        x = np.where(np.isfinite(rows.bx_lo[0]), rows.A @ state.x + 0.5 * rows.bx_lo[0] + 0.5 * rows.bx_hi[0], state.x)
+        return SetState(
+            -free,
+            free,
+            np.where(np.isfinite(x), x, state.x),
+            shape,
+            state.rows + 1,
+            state.rows + 1 if first else state.conflict,
+            which if first else state.which,
+        )
+
+    def _estimate(
+        self,
+        model: Model,
+        state: SetState,
+        t: Array,
+        lo: Array,
+        hi: Array,
+        x: Array,
+        *,
+        replace_labels: Record | None = None,
+    ) -> Estimate:
+        """Wrap boxes and points; from a contradiction on nothing is claimed."""
+        info: dict[str, Any] = {"rows": state.rows}
+        status = Status.OK
+        if state.conflict:
+            status, k = Status.INFEASIBLE, state.conflict - 1
+            output = state.which >= model.nx
+            name = (model.names.y if output else model.names.x)[state.which - (model.nx if output else 0)]
+            here = k - (state.rows - len(t))  # its row in this answer
+            when = f"at t = {t[here]:.9g} s" if here >= 0 else f"since row {k}"
+            kind = "output" if output else "state"
+            info["message"] = f"{status.value} {when}: {kind} `{name}` contradicts the rows before it"
+            info["conflicts"] = [{"t": float(t[here]) if here >= 0 else None, "row": k, "kind": kind, "name": name}]
+            info["hint"] = "make the outputs that info['conflicts'] names missing, or widen the half-widths"
+            lo, hi = lo.copy(), hi.copy()
+            lo[max(here, 0) :], hi[max(here, 0) :] = -np.inf, np.inf
+        assert isinstance(model.w, Uniform)
+        assert isinstance(model.e, Uniform)
+        found = Estimate(t, x, Box(lo, hi), status, typed(self), q=model.w.q, r=model.e.q, names=model.names.x, info=info)
+        return found if replace_labels is None else replace(found, labels=replace_labels.labels)
+
+
+@dataclass(frozen=True)
+class IntervalFilter(_Recursion):
+    """A box that contains the state: the cheapest set.
+
+    The rows of the newest step are contracted forwards and backwards, twice. The prior may be without ends.
+
+    Examples
+    --------
+    >>> import halfwidth as hw
+    >>> walk = hw.Linear([[1]], None, [[1]], hw.Uniform(0.1), hw.Uniform(0.5), hw.Box(-1, 1))
+    >>> est = hw.estimate(walk, hw.Record([0.0, 1.0, 2.0], [0.9, None, 0.2]), hw.IntervalFilter())
+    >>> [a.round(3).ravel().tolist() for a in est.interval()]
+    [[0.4, 0.3, 0.2], [1.1, 1.2, 0.7]]
+    """
+
+    def _sizes(self, model: Model) -> tuple[str, int, int]:  # noqa: ARG002
+        return "interval", 0, 0
+
+
+@dataclass(frozen=True)
+class ZonotopeFilter(_Recursion):
+    """A zonotope that contains the state: outputs enter with the gain that makes its generators least.
+
+    Parameters
+    ----------
+    order : int
+        Most generators a state between rows; more are tighter and slower, and 20 are hardly worse than any number.
+    """
+
+    order: int = 10
+
+    def __post_init__(self) -> None:
+        _whole(self.order, "order", 1)
+
+    def _sizes(self, model: Model) -> tuple[str, int, int]:
+        return "zonotope", self.order * model.nx, 0
+
+
+@dataclass(frozen=True)
+class ConstrainedZonotopeFilter(_Recursion):
+    """A zonotope cut by the newest outputs, nearly the exact set.
+
+    The outputs of the newest rows are kept as constraints; the oldest become part of the generators as in
+    `ZonotopeFilter`. The box of the set comes from small linear programs, whose bounds hold even where they stop early.
+
+    Parameters
+    ----------
+    order : int
+        Most generators a state between rows.
+    memory : int
+        Constraints kept between rows, in units of the outputs of a row.
+    """
+
+    order: int = 12
+    memory: int = 4
+
+    def __post_init__(self) -> None:
+        _whole(self.order, "order", 1)
+        _whole(self.memory, "memory", 1)
+
+    def _sizes(self, model: Model) -> tuple[str, int, int]:
+        return "constrained", self.order * model.nx, self.memory * model.ny
+
+
+@dataclass(frozen=True)
+class EllipsoidFilter(_Recursion):
+    """An ellipsoid that contains the state: sums and intersections of least trace, each coordinate in its own width."""
+
+    def _sizes(self, model: Model) -> tuple[str, int, int]:  # noqa: ARG002
+        return "ellipsoid", 0, 0
+
+
+def _whole(value: object, name: str, least: int) -> None:
+    if not isinstance(value, int | np.integer) or value < least:
+        raise BadValue(f"`{name}` is {value!r}, a whole number from {least} was expected")
+
+
+class _Tapes(NamedTuple):
+    g: Tape
+    h: Tape
+
+
+_KNOWN: WeakKeyDictionary[Nonlinear, _Tapes | str] = WeakKeyDictionary()
+
+
+def _tapes(model: Nonlinear) -> _Tapes | str:
+    """Return g and h of a model as tapes, or why they cannot be recorded."""
+    found = _KNOWN.get(model)
+    if found is None:
+        found = _KNOWN[model] = _recorded(model)
+    return found
+
+
+def _recorded(model: Nonlinear) -> _Tapes | str:
+    assert isinstance(model.x0, Box)
+    rng = np.random.default_rng(0)
+    middle = model.x0.mean
+    half = np.where(np.isfinite(model.x0.hi - model.x0.lo), 0.5 * (model.x0.hi - model.x0.lo), 1.0)
+    arguments = (np.zeros(model.nu) if model.nu else None, float(model.dt))[: arity(model.g, 3) - 1]
+    points = [middle + s * half * rng.uniform(-1.0, 1.0, model.nx) for s in (0.0, 0.3, 1.0, 1.0)]
+    name = "g"
+    try:
+        g = compiled(model.g, (model.nx, model.nu, None)[: 1 + len(arguments)], [(x, *arguments) for x in points])
+        name = "h"
+        h = compiled(model.h, (model.nx,), [(x,) for x in points])
+    except Untraceable as error:
+        return f"`{name}` cannot be recorded: {error}"
+    return _Tapes(g, h)
+
+
+def _ordered(inside: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return bounds that a kernel takes; a crossing is judged by the caller."""
+    return np.ascontiguousarray(np.minimum(*inside)), np.ascontiguousarray(np.maximum(*inside))
+
+
+def _turned(model: Nonlinear, y: Array, lo: Array, hi: Array) -> Array:
+    """Return outputs with angles on the turn that h may be on; NaN where that is more than one."""
+    if not model.y_angles:
+        return y
+    assert isinstance(model.e, Uniform)
+    found = y.copy()
+    for i in model.y_angles:
+        reach = np.broadcast_to(model.e.q, y.shape)[i] + 1e-12
+        first, last = np.ceil((lo[i] - reach - y[i]) / _TURN), np.floor((hi[i] + reach - y[i]) / _TURN)
+        if first == last:
+            found[i] = y[i] + first * _TURN
+        elif not first > last:
+            found[i] = np.nan
+    return found
