@@ -21,7 +21,7 @@ namespace HW_ISA {
 struct Ellipsoid {
     int n;
     double *c, *X;                                // state
-    double *M, *rM, *W, *rW, *rest, *v, *d, *wt;  // work
+    double *M, *rM, *W, *rW, *rest, *v, *d, *wt, *roots;  // work
 
     static std::size_t state(const SetSizes& z) { return 2 + z.n + std::size_t(z.n) * z.n; }
     static std::size_t work(const SetSizes& z) { return 6 * std::size_t(z.n) * z.n + 10 * z.n; }
@@ -35,6 +35,7 @@ struct Ellipsoid {
         v = rest + 3 * n;
         d = v + n;
         wt = d + n;
+        roots = wt + n;
     }
 
     void start(const double* lo, const double* hi) {
@@ -45,8 +46,6 @@ struct Ellipsoid {
             X[i * n + i] = (1.0 + 8.0 * eps) * n * x.rad * x.rad;
         }
     }
-
-    double trace_of(double s, int i) const { return wt[i] * s; }
 
     void move(const Motion& q) {
         // x = M x_ + W (b + noise), rows solved from the last up; rM, rW bound what rounding did to M, W
@@ -119,22 +118,22 @@ struct Ellipsoid {
             for (int i = 0; i <= k; i++) t += wt[i] * W[i * n + k] * W[i * n + k];
             const double a = w[k] > 0.0 ? std::sqrt(t) * w[k] + floor_of : 0.0, b = rest[k] > 0.0 ? std::sqrt(wt[k]) * rest[k] + floor_of : 0.0;
             root += a + b;
-            M[k] = a;  // M is used up
-            M[n + k] = b;
+            roots[k] = a;
+            roots[n + k] = b;
         }
         for (int i = 0; i < n; i++) {
             d2[i] = reach[i] * reach[i] / t0;
             for (int j = 0; j < n; j++) X[i * n + j] = Y[i * n + j] / t0;
         }
         for (int k = 0; k < n; k++) {
-            if (M[k] > 0.0)
+            if (roots[k] > 0.0)
                 for (int i = 0; i <= k; i++) {
-                    const double f = W[i * n + k] * w[k] * (w[k] / M[k]);
+                    const double f = W[i * n + k] * w[k] * (w[k] / roots[k]);
                     d2[i] += f * W[i * n + k];
                     for (int j = 0; j <= k; j++) X[i * n + j] += f * W[j * n + k];
                 }
-            if (M[n + k] > 0.0) {
-                const double f = rest[k] * (rest[k] / M[n + k]);
+            if (roots[n + k] > 0.0) {
+                const double f = rest[k] * (rest[k] / roots[n + k]);
                 d2[k] += f;
                 X[k * n + k] += f;
             }

@@ -44,7 +44,13 @@ std::ptrdiff_t run_sets(const SetRun& r) {
             two_lo[j] = was_lo[j], two_hi[j] = was_hi[j];
             two_lo[n + j] = lo[j], two_hi[n + j] = hi[j];  // bounds of the state come in here
         }
+        if (born < 0.0 && all_finite(Dim<0>(n), was_lo) && all_finite(Dim<0>(n), was_hi)) {
+            shape.start(was_lo, was_hi);
+            born = shape.sound() ? 0.0 : -1.0;
+        }
         int bad = 0;
+        for (int j = 0; j < n; j++)
+            if (!(two_lo[n + j] <= two_hi[n + j])) bad = 1 + j;
         for (int round = 0; round < 2 && !bad; round++) {
             bad = box_dynamics(b, t, two_lo, two_hi, box_work);
             if (!bad) bad = box_outputs(b, t, two_lo + n, two_hi + n, box_work);
@@ -109,23 +115,16 @@ std::ptrdiff_t run_sets(const SetRun& r) {
             born = -1.0;
             for (int j = 0; j < n; j++) two_lo[n + j] = -inf, two_hi[n + j] = inf;
         }
-        bool bounded = true;
         const double* x_was = r.x + std::ptrdiff_t(t) * n;
         double* x = r.x + std::ptrdiff_t(t + 1) * n;
         for (int j = n - 1; j >= 0; j--) {
             lo[j] = two_lo[n + j];
             hi[j] = two_hi[n + j];
             const double middle = 0.5 * lo[j] + 0.5 * hi[j];
-            bounded = bounded && finite(lo[j]) && finite(hi[j]);
             double s = 0.5 * motion.b_lo[j] + 0.5 * motion.b_hi[j];
             for (int l = 0; l < n; l++) s += motion.A(j, l).mid * x_was[l];
             for (int l = j + 1; l < n; l++) s -= motion.E(j, l).mid * x[l];
             x[j] = finite(middle) ? middle : finite(s) ? min2(max2(s, lo[j]), hi[j]) : finite(x_was[j]) ? x_was[j] : 0.0;
-        }
-        if (born < 0.0 && bounded && !bad) {
-            born = 0.0;
-            shape.start(lo, hi);
-            if (!shape.sound()) born = -1.0;
         }
     }
     return first;

@@ -6,8 +6,8 @@ Hessian. `affine` turns that into what a method for linear models can use: a mat
     |f(x) - J x - k| <= half     for every x of the box,
 
 by the mean value form or by the second-order form, whichever is narrower in a row [1]_. A nonlinear step
-``x[t] = g(x[t-1]) + w[t]`` is then the linear step ``x[t] = J x[t-1] + k + w'[t]`` with half-widths ``q + half``, and an
-output ``y = h(x) + e`` a row with half-width ``r + half``: the true state obeys both.
+``x[t] = g(x[t-1]) + w[t]`` is then the linear step ``x[t] = J x[t-1] + k + w'[t]`` with half-widths ``q + half``, and
+an output ``y = h(x) + e`` a row with half-width ``r + half``: the true state obeys both.
 
 What is proved is about the recorded operations. The functions of the C library are taken to be right within eight
 units in the last place (glibc states at most four).
@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import halfwidth._core as _core
+from halfwidth._core import tape_affine
 from halfwidth.array import Array
 from halfwidth.trace import Tape
 
@@ -67,5 +67,5 @@ def affine(tape: Tape, lo: Array, hi: Array, *more: Any) -> Affine:
     """
     rest = [np.atleast_1d(np.asarray(a, dtype=np.float64)).ravel() for a in more if a is not None]
     low, high = np.concatenate([lo, *rest]), np.concatenate([hi, *rest])
-    J, k, half, value = _core.tape_affine(tape.code, tape.constant, tape.out, low, high, len(lo))
+    J, k, half, value = tape_affine(tape.code, tape.constant, tape.out, low, high, len(lo))
     return Affine(J, k, half, value[:, 0], value[:, 1])

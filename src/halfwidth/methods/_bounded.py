@@ -2,8 +2,8 @@
 
     E x[t] - A x[t-1]  in  [bx_lo, bx_hi] = B u[t] -+ q          C x[t]  in  [by_lo, by_hi] = F y[t] -+ r
 
-A matrix whose ends differ is an interval matrix: its unknown entries (NaN) lie within ``theta_bounds``. Outputs that are
-not seen have infinite ends. An unseen output that seen ones are correlated with through F is eliminated: a seen row
+A matrix whose ends differ is an interval matrix: its unknown entries (NaN) lie within ``theta_bounds``. Outputs that
+are not seen have infinite ends. An unseen output that seen ones are correlated with through F is eliminated: a seen row
 then holds a multiple N of the rows of F y = C x + e, its half-width is |N| r, and N itself is an interval, since the
 elimination rounds.
 """
@@ -11,6 +11,7 @@ elimination rounds.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.methods._residuals import eliminate
@@ -28,21 +29,21 @@ class Rows:
 
     Parameters
     ----------
-    E, A, C : arrays, E None for identity
+    A_lo, C_lo, E_lo : arrays, E None for identity
         Lower ends.
-    E_hi, A_hi, C_hi : arrays or None
+    A_hi, C_hi, E_hi : arrays or None
         Upper ends; None where the matrix is exact.
     bx_lo, bx_hi : (T, nx) arrays
     by_lo, by_hi : (T, ny) arrays
     """
 
-    E: Array | None
-    A: Array
-    C: Array
+    A_lo: Array
+    C_lo: Array
     bx_lo: Array
     bx_hi: Array
     by_lo: Array
     by_hi: Array
+    E_lo: Array | None = None
     E_hi: Array | None = None
     A_hi: Array | None = None
     C_hi: Array | None = None
@@ -75,7 +76,9 @@ def refuses(model: Model, name: str) -> str | None:
             )
         wrong = [e for e in model.theta_entries if e.matrix == "F"]
         if wrong:
-            return f"`{name}` needs a known F but `F[{wrong[0].row}, {wrong[0].column}]` is unknown\nhint: give it a value"
+            return (
+                f"`{name}` needs a known F but `F[{wrong[0].row}, {wrong[0].column}]` is unknown\nhint: give it a value"
+            )
     return None
 
 
@@ -113,18 +116,8 @@ def linear_rows(model: Linear, t: Array, dt: Array, y: Array, u: Array | None, *
     if "F" in ends:
         C, C_hi, z_lo, z_hi, half = _correlated(ends["F"][0], C, C_hi, z, half, seen)
     by_lo, by_hi = grown(z_lo, z_hi, half)
-    return Rows(
-        E,
-        A,
-        C,
-        bx_lo,
-        bx_hi,
-        np.where(seen, by_lo, -np.inf),
-        np.where(seen, by_hi, np.inf),
-        E_hi,
-        A_hi,
-        C_hi,
-    )
+    by = np.where(seen, by_lo, -np.inf), np.where(seen, by_hi, np.inf)
+    return Rows(A, C, bx_lo, bx_hi, *by, E, E_hi, A_hi, C_hi)
 
 
 def grown(lo: Array, hi: Array, half: Array) -> tuple[Array, Array]:
@@ -163,7 +156,7 @@ def _ends(model: Linear, name: str, matrix: Varying, t: Array, dt: Array, first:
 
 
 def _correlated(
-    F: Array, C: Array, C_hi: Array | None, z: Array, r: Array, seen: Array
+    F: Array, C: Array, C_hi: Array | None, z: Array, r: Array, seen: NDArray[np.bool_]
 ) -> tuple[Array, Array | None, Array, Array, Array]:
     """Fold F in: C and its upper ends, both ends of the left side, and the half-widths of the seen rows."""
     T, ny = z.shape
@@ -171,17 +164,17 @@ def _correlated(
     N = eliminate(F, seen)
     # The same elimination with every term of one sign bounds what rounding can be.
     most = np.abs(eliminate(2.0 * np.eye(ny) - np.abs(F), seen))
-    off = 8 * ny * _EPS * np.where(np.abs(N - np.eye(ny)).any(axis=(1, 2))[:, None, None], most, 0.0)
+    off = 8 * ny * _EPS * np.where(np.any(N - np.eye(ny), axis=(1, 2))[:, None, None], most, 0.0)
     left = N @ F
     size = (most + off) @ np.abs(F) @ np.abs(z)[:, :, None]
     middle, slack = (left @ z[:, :, None])[:, :, 0], (16 * ny * _EPS) * size[:, :, 0]
     lo = np.broadcast_to(C, (T, *C.shape[-2:]))
     hi = lo if C_hi is None else np.broadcast_to(C_hi, lo.shape)
-    moved = off.any() or (N != np.eye(ny)).any()
+    moved = off.any() or bool(np.abs(N - np.eye(ny)).any())
     if moved:
         plus, minus = np.maximum(N, 0.0), np.minimum(N, 0.0)
         width = (off + 4 * ny * _EPS * most) @ np.maximum(np.abs(lo), np.abs(hi))
-        exact = ~np.abs(N - np.eye(ny)).any(axis=(1, 2))[:, None, None]
+        exact = ~np.any(N - np.eye(ny), axis=(1, 2))[:, None, None]
         lo, hi = (
             np.where(exact, lo, plus @ lo + minus @ hi - width),
             np.where(exact, hi, plus @ hi + minus @ lo + width),

@@ -37,8 +37,8 @@ class Estimator(Protocol):
 class Recursive(Protocol[State]):
     """A method that takes one row at a time; a step returns a new state and changes nothing.
 
-    One whose answer is not Gaussian gives ``answer(model, state, t) -> Estimate`` of the newest row instead of `belief`,
-    and its own `run`.
+    One whose answer is not Gaussian gives ``answer(model, state, t) -> Estimate`` of the newest row instead of
+    `belief`, and its own `run`.
     """
 
     def init(self, model: Model) -> State:

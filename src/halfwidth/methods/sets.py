@@ -133,14 +133,14 @@ class _Recursion:
     def _advance(
         self, model: Model, state: SetState, rows: Rows, inside: tuple[Array, Array] | None = None
     ) -> tuple[SetState, Array, Array, Array]:
-        """Run the kernel over some rows: the state after them, and boxes and points of each; `inside` bounds them all."""
+        """Run the kernel over some rows: the state after them, boxes and points of each; `inside` bounds all."""
         kind, generators, constraints = self._sizes(model)
         if inside is None and model.bounds is not None:
             inside = model.bounds.lo, model.bounds.hi
         low, high = (None, None) if inside is None else inside
         lo, hi, x, shape, code = _core.sets_run(
-            kind, rows.E, rows.A, rows.C, rows.bx_lo, rows.bx_hi, rows.by_lo, rows.by_hi, state.lo, state.hi, state.x,
-            state.shape, generators, constraints, low, high, rows.E_hi, rows.A_hi, rows.C_hi,
+            kind, rows.E_lo, rows.A_lo, rows.C_lo, rows.bx_lo, rows.bx_hi, rows.by_lo, rows.by_hi, state.lo, state.hi,
+            state.x, state.shape, generators, constraints, low, high, rows.E_hi, rows.A_hi, rows.C_hi,
         )  # fmt: skip
         conflict, which = state.conflict, state.which
         if code and not conflict:
@@ -157,53 +157,30 @@ class _Recursion:
         assert isinstance(model.e, Uniform)
         more = (None if u is None else u[0], dt)[: arity(model.g, 3) - 1]
         g = affine(tapes.g, state.lo, state.hi, *more)
-        with np.errstate(invalid="ignore"):
-            half = np.nextafter(g.half + model.w.q, np.inf)
-            rows = Rows(None, g.J, np.zeros((0, model.nx)), *(b[None] for b in grown(g.k, g.k, half)), *2 * (np.zeros((1, 0)),))
+        bx_lo, bx_hi = grown(g.k, g.k, np.nextafter(g.half + model.w.q, np.inf))
+        free = np.full((1, model.ny), np.inf)
+        rows = Rows(g.J, np.zeros((model.ny, model.nx)), bx_lo[None], bx_hi[None], -free, free)
         inside = grown(g.lo, g.hi, model.w.q)
         if model.bounds is not None:
             inside = np.maximum(inside[0], model.bounds.lo), np.minimum(inside[1], model.bounds.hi)
         # The motion alone says where h is to be enclosed; what the outputs then say is where it is enclosed again.
-        box = _core.sets_run(
-            "interval", None, rows.A, rows.C, rows.bx_lo, rows.bx_hi, rows.by_lo, rows.by_hi, state.lo, state.hi, state.x,
-            _core.sets_start("interval", model.nx, 0), 0, 0, *_ordered(inside),
-        )  # fmt: skip
-        if box[4] or np.any(inside[0] > inside[1]):
-            return self._contradicted(model, state, rows, box[4])
-        inside = box[0][-1], box[1][-1]
-        for last in (False, True):
+        box = IntervalFilter()
+        before = replace(state, shape=_core.sets_start("interval", model.nx, model.ny))
+        after = box._advance(model, before, rows, inside)[0]
+        if after.conflict > state.rows:
+            return self._advance(model, state, rows, inside)[0]
+        for _ in range(2):
+            inside = after.lo, after.hi
             h = affine(tapes.h, *inside)
             target = _turned(model, y[0], h.lo, h.hi)
-            with np.errstate(invalid="ignore"):
-                half = np.nextafter(h.half + model.e.q, np.inf)
-                by_lo, by_hi = grown(*grown(target, target, np.abs(h.k) * 4e-16 + np.abs(target) * 4e-16), half)
-                by_lo, by_hi = np.nextafter(by_lo - h.k, -np.inf), np.nextafter(by_hi - h.k, np.inf)
+            off = 4e-16 * (np.abs(target) + np.abs(h.k))
+            by_lo, by_hi = grown(target - h.k - off, target - h.k + off, np.nextafter(h.half + model.e.q, np.inf))
             blind = np.isnan(by_lo) | np.isnan(by_hi)
-            full = replace(rows, C=h.J, by_lo=np.where(blind, -np.inf, by_lo)[None], by_hi=np.where(blind, np.inf, by_hi)[None])
-            new = self._advance(model, state, full, inside)[0]
-            if last or new.conflict > state.rows:
-                return new
-            inside = new.lo, new.hi
-        raise AssertionError
-
-    def _contradicted(self, model: Nonlinear, state: SetState, rows: Rows, code: int) -> SetState:
-        """Return the state after a motion that leaves the bounds."""
-        n = model.nx
-        which = (code - 1) % n if code else 0
-        free = np.full(n, np.inf)
-        kind, generators, constraints = self._sizes(model)
-        shape = _core.sets_start(kind, n, model.ny, generators, constraints)
-        first = not state.conflict
-        x = np.where(np.isfinite(rows.bx_lo[0]), rows.A @ state.x + 0.5 * rows.bx_lo[0] + 0.5 * rows.bx_hi[0], state.x)
-        return SetState(
-            -free,
-            free,
-            np.where(np.isfinite(x), x, state.x),
-            shape,
-            state.rows + 1,
-            state.rows + 1 if first else state.conflict,
-            which if first else state.which,
-        )
+            by = np.where(blind, -np.inf, by_lo)[None], np.where(blind, np.inf, by_hi)[None]
+            after = self._advance(model, state, replace(rows, C_lo=h.J, by_lo=by[0], by_hi=by[1]), inside)[0]
+            if after.conflict > state.rows:
+                break
+        return after
 
     def _estimate(
         self,
@@ -233,7 +210,9 @@ class _Recursion:
             lo[max(here, 0) :], hi[max(here, 0) :] = -np.inf, np.inf
         assert isinstance(model.w, Uniform)
         assert isinstance(model.e, Uniform)
-        found = Estimate(t, x, Box(lo, hi), status, typed(self), q=model.w.q, r=model.e.q, names=model.names.x, info=info)
+        found = Estimate(
+            t, x, Box(lo, hi), status, typed(self), q=model.w.q, r=model.e.q, names=model.names.x, info=info
+        )
         return found if replace_labels is None else replace(found, labels=replace_labels.labels)
 
 
@@ -263,10 +242,10 @@ class ZonotopeFilter(_Recursion):
     Parameters
     ----------
     order : int
-        Most generators a state between rows; more are tighter and slower, and 20 are hardly worse than any number.
+        Most generators a state between rows; more are tighter and slower.
     """
 
-    order: int = 10
+    order: int = 20
 
     def __post_init__(self) -> None:
         _whole(self.order, "order", 1)
@@ -290,8 +269,8 @@ class ConstrainedZonotopeFilter(_Recursion):
         Constraints kept between rows, in units of the outputs of a row.
     """
 
-    order: int = 12
-    memory: int = 4
+    order: int = 20
+    memory: int = 2
 
     def __post_init__(self) -> None:
         _whole(self.order, "order", 1)
@@ -345,11 +324,6 @@ def _recorded(model: Nonlinear) -> _Tapes | str:
     except Untraceable as error:
         return f"`{name}` cannot be recorded: {error}"
     return _Tapes(g, h)
-
-
-def _ordered(inside: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return bounds that a kernel takes; a crossing is judged by the caller."""
-    return np.ascontiguousarray(np.minimum(*inside)), np.ascontiguousarray(np.maximum(*inside))
 
 
 def _turned(model: Nonlinear, y: Array, lo: Array, hi: Array) -> Array:
