@@ -14,6 +14,7 @@ void bind_chain(nb::module_& m);
 void bind_enclose(nb::module_& m);
 void bind_sets(nb::module_& m);
 void bind_box(nb::module_& m);
+void bind_hull(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -30,4 +31,5 @@ NB_MODULE(_core, m) {
     bind_enclose(m);
     bind_sets(m);
     bind_box(m);
+    bind_hull(m);
 }

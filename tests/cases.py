@@ -115,6 +115,7 @@ def _settings():
         "KalmanSmoother": [{"lag": 4}],
         "ExtendedKalman": [{"smooth": True}],
         "UnscentedKalman": [{"smooth": True}],
+        "Hull": [{"memory": 10}, {"memory": 5, "lag": 4}, {"lag": 0}],
     }
     found = []
     for name in ESTIMATORS:

@@ -7,12 +7,12 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud ConstrainedZonotopeFilter
+BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Bound Box Cloud ConstrainedZonotopeFilter
 DataQualityWarning EllipsoidFilter Estimate Estimator ExtendedKalman FearnheadClifford GPB Gaussian HalfwidthError
-IntervalFilter KalmanFilter KalmanSmoother Learned Linear LogTooBig Markov MemoryChoice Missing Mixed Nonlinear Normal
-ParticleFilter RBPF Record Recursive Refused Runnalls SequentialLP Status Uniform UnscentedKalman Unsolved Window
-ZonotopeFilter __version__ choose_memory ensemble_interval estimate forecast from_continuous learn resume score
-simulate stream
+Hull IntervalFilter KalmanFilter KalmanSmoother Learned Linear LogTooBig Markov MemoryChoice Missing Mixed Nonlinear
+Normal ParticleFilter RBPF Record Recursive Refused Runnalls SequentialLP Status Uniform UnscentedKalman Unsolved
+Window ZonotopeFilter __version__ bound choose_memory ensemble_interval estimate forecast from_continuous learn resume
+score simulate stream
 """
 
 

@@ -38,6 +38,8 @@ _HOME: dict[str, str] = {
     "forecast": "forecast",
     "ensemble_interval": "methods.window",
     "choose_memory": "methods.window",
+    "bound": "methods.hull",
+    "Bound": "methods.hull",
     "MemoryChoice": "methods.window",
     "learn": "learn",
     "Learned": "learn",
@@ -77,6 +79,9 @@ if TYPE_CHECKING:
     from halfwidth.loss import Markov as Markov
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.methods.hull import Bound as Bound
+    from halfwidth.methods.hull import Hull as Hull
+    from halfwidth.methods.hull import bound as bound
     from halfwidth.methods.kalman import KalmanFilter as KalmanFilter
     from halfwidth.methods.kalman import KalmanSmoother as KalmanSmoother
     from halfwidth.methods.loss import BKF1 as BKF1

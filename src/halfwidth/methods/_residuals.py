@@ -104,7 +104,7 @@ def residuals(model: Linear, record: Record) -> Residuals:
         N, Cy, Fy = None, C, y
     else:
         F = every(model.F)
-        N = eliminate(F, record.seen)
+        N = _eliminate(F, record.seen)
         Cy, Fy = N @ C, np.einsum("tij,tj->ti", N @ F, y)
 
     # State rows t nx + i on columns t nx + j (x[t-1]) and (t + 1) nx + j (x[t]).
@@ -142,7 +142,7 @@ def residuals(model: Linear, record: Record) -> Residuals:
     return Residuals(M, np.r_[drive.ravel(), Fy[seen_t, seen_j]], S, row, group, T, nx, ny)
 
 
-def eliminate(F: Array, seen: NDArray[np.bool_]) -> Array:
+def _eliminate(F: Array, seen: NDArray[np.bool_]) -> Array:
     """Return N (T, ny, ny), unit upper triangular, such that seen rows of N F are 0 in the unseen columns."""
     T, ny = seen.shape
     N = np.array(np.broadcast_to(np.eye(ny), (T, ny, ny)))

@@ -8,7 +8,7 @@ and a matrix [4]_. The box runs beside each of the others and both tighten each 
 of `IntervalFilter`; all lie around the exact hull.
 
 Rounding is accounted for, so the boxes contain in floating point. A row that contradicts the rows before it is named,
-the status is INFEASIBLE, and from there on nothing is claimed. Nonlinear models are taken where `g` and `h` can be
+and the status is INFEASIBLE. Nonlinear models are taken where `g` and `h` can be
 recorded: over the newest box they are replaced by affine functions with a proved distance, which widens the noise
 (`halfwidth.enclosure`). Unknown entries of A, B, C, E within finite ``theta_bounds`` make an interval matrix.
 
@@ -30,12 +30,11 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.enclosure import affine
 from halfwidth.errors import BadValue, Refused, hinted
-from halfwidth.methods import _bounded
-from halfwidth.methods._bounded import Rows, grown, linear_rows
+from halfwidth.methods._bounds import Rows, down, interval_rows, one_row, up
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear, arity
 from halfwidth.noise import Uniform
-from halfwidth.record import Record
+from halfwidth.record import Labels, Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box
 from halfwidth.trace import Tape, Untraceable, compiled
@@ -77,7 +76,7 @@ class _Recursion:
 
     def refuses(self, model: Model) -> str | None:
         """Return why the model cannot be taken, or None."""
-        reason = _bounded.refuses(model, type(self).__name__)
+        reason = _refuses(model, type(self).__name__)
         if reason is None and isinstance(model, Nonlinear):
             why = _tapes(model)
             if isinstance(why, str):
@@ -90,17 +89,16 @@ class _Recursion:
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
         """Enclose the state at every row, from the rows up to it."""
         state = self.init(model)
-        dt = record.steps(model.dt)
         if isinstance(model, Linear):
-            rows = linear_rows(model, record.t, dt, record.y, record.u)
-            state, lo, hi, x = self._advance(model, state, rows)
+            state, lo, hi, x = self._advance(model, state, interval_rows(model, record))
         else:
+            dt = record.steps(model.dt)
             lo, hi, x = (np.empty((len(record), model.nx)) for _ in range(3))
             for k in range(len(record)):
                 u = None if record.u is None else record.u[k]
                 state = self.step(model, state, record.y[k], u, float(record.t[k]), float(dt[k]))
                 lo[k], hi[k], x[k] = state.lo, state.hi, state.x
-        return self._estimate(model, state, record.t, lo, hi, x, replace_labels=record)
+        return self._estimate(model, state, record.t, lo, hi, x, record.labels)
 
     def init(self, model: Model) -> SetState:
         """Return the set one step before the first row."""
@@ -115,16 +113,13 @@ class _Recursion:
 
     def step(self, model: Model, state: SetState, y: Array, u: Array | None, t: float, dt: float) -> SetState:
         """Return the set after one row; NaN in `y` is missing."""
-        outputs = np.asarray(y, dtype=np.float64).reshape(1, model.ny)
-        inputs = None if u is None else np.asarray(u, dtype=np.float64).reshape(1, model.nu)
         if isinstance(model, Linear):
-            rows = linear_rows(model, np.array([t]), np.array([dt]), outputs, inputs, first=state.rows)
-            return self._advance(model, state, rows)[0]
-        return self._nonlinear(model, state, outputs, inputs, dt)
+            return self._advance(model, state, one_row(model, y, u, t, dt, state.rows))[0]
+        return self._nonlinear(model, state, y, u, dt)
 
     def answer(self, model: Model, state: SetState, t: float) -> Estimate:
         """Return the estimate of the newest row, for a stream."""
-        return self._estimate(model, state, np.array([t]), state.lo[None], state.hi[None], state.x[None])
+        return self._estimate(model, state, np.array([t]), state.lo[None], state.hi[None], state.x[None], Labels())
 
     def _sizes(self, model: Model) -> tuple[str, int, int]:
         """Return kind of set, most generators and most constraints."""
@@ -155,12 +150,12 @@ class _Recursion:
         assert not isinstance(tapes, str)
         assert isinstance(model.w, Uniform)
         assert isinstance(model.e, Uniform)
-        more = (None if u is None else u[0], dt)[: arity(model.g, 3) - 1]
+        more = (u, dt)[: arity(model.g, 3) - 1]
         g = affine(tapes.g, state.lo, state.hi, *more)
-        bx_lo, bx_hi = grown(g.k, g.k, np.nextafter(g.half + model.w.q, np.inf))
+        half = up(g.half + model.w.q)
         free = np.full((1, model.ny), np.inf)
-        rows = Rows(g.J, np.zeros((model.ny, model.nx)), bx_lo[None], bx_hi[None], -free, free)
-        inside = grown(g.lo, g.hi, model.w.q)
+        rows = Rows(g.J, np.zeros((model.ny, model.nx)), down(g.k - half)[None], up(g.k + half)[None], -free, free)
+        inside = down(g.lo - model.w.q), up(g.hi + model.w.q)
         if model.bounds is not None:
             inside = np.maximum(inside[0], model.bounds.lo), np.minimum(inside[1], model.bounds.hi)
         # The motion alone says where h is to be enclosed; what the outputs then say is where it is enclosed again.
@@ -172,9 +167,9 @@ class _Recursion:
         for _ in range(2):
             inside = after.lo, after.hi
             h = affine(tapes.h, *inside)
-            target = _turned(model, y[0], h.lo, h.hi)
-            off = 4e-16 * (np.abs(target) + np.abs(h.k))
-            by_lo, by_hi = grown(target - h.k - off, target - h.k + off, np.nextafter(h.half + model.e.q, np.inf))
+            half = up(h.half + model.e.q)
+            target = _turned(model, y, h.lo, h.hi)
+            by_lo, by_hi = down(down(target[0] - h.k) - half), up(up(target[1] - h.k) + half)
             blind = np.isnan(by_lo) | np.isnan(by_hi)
             by = np.where(blind, -np.inf, by_lo)[None], np.where(blind, np.inf, by_hi)[None]
             after = self._advance(model, state, replace(rows, C_lo=h.J, by_lo=by[0], by_hi=by[1]), inside)[0]
@@ -190,30 +185,28 @@ class _Recursion:
         lo: Array,
         hi: Array,
         x: Array,
-        *,
-        replace_labels: Record | None = None,
+        labels: Labels,
     ) -> Estimate:
-        """Wrap boxes and points; from a contradiction on nothing is claimed."""
-        info: dict[str, Any] = {"rows": state.rows}
-        status = Status.OK
-        if state.conflict:
-            status, k = Status.INFEASIBLE, state.conflict - 1
-            output = state.which >= model.nx
-            name = (model.names.y if output else model.names.x)[state.which - (model.nx if output else 0)]
-            here = k - (state.rows - len(t))  # its row in this answer
-            when = f"at t = {t[here]:.9g} s" if here >= 0 else f"since row {k}"
-            kind = "output" if output else "state"
-            info["message"] = f"{status.value} {when}: {kind} `{name}` contradicts the rows before it"
-            info["conflicts"] = [{"t": float(t[here]) if here >= 0 else None, "row": k, "kind": kind, "name": name}]
-            info["hint"] = "make the outputs that info['conflicts'] names missing, or widen the half-widths"
-            lo, hi = lo.copy(), hi.copy()
-            lo[max(here, 0) :], hi[max(here, 0) :] = -np.inf, np.inf
+        """Wrap boxes and points; where rows contradict there is no box."""
         assert isinstance(model.w, Uniform)
         assert isinstance(model.e, Uniform)
-        found = Estimate(
-            t, x, Box(lo, hi), status, typed(self), q=model.w.q, r=model.e.q, names=model.names.x, info=info
+        info: dict[str, Any] = {"rows": state.rows}
+        if not state.conflict:
+            spread, status = Box(lo, hi), Status.OK
+        else:
+            spread, status = None, Status.INFEASIBLE
+            row = state.conflict - 1
+            output = state.which >= model.nx
+            name = model.names.y[state.which - model.nx] if output else model.names.x[state.which]
+            here = row - (state.rows - len(t))  # where it is in this answer
+            when = f"t = {t[here]:.9g} s" if here >= 0 else f"row {row}"
+            kind = "output" if output else "state"
+            info["message"] = f"{status.value} at {when}: {kind} `{name}` contradicts the rows before it"
+            info["conflict"] = [{"t": float(t[here]) if here >= 0 else None, "row": row, "kind": kind, "name": name}]
+            info["hint"] = "leave what info['conflict'] names away, or declare wider half-widths"
+        return Estimate(
+            t, x, spread, status, typed(self), q=model.w.q, r=model.e.q, names=model.names.x, labels=labels, info=info
         )
-        return found if replace_labels is None else replace(found, labels=replace_labels.labels)
 
 
 @dataclass(frozen=True)
@@ -288,6 +281,30 @@ class EllipsoidFilter(_Recursion):
         return "ellipsoid", 0, 0
 
 
+def _refuses(model: Model, name: str) -> str | None:
+    """Return why a method for known half-widths cannot take a model, or None."""
+    for symbol, noise in (("w", model.w), ("e", model.e)):
+        if not isinstance(noise, Uniform):
+            kind = type(noise).__name__
+            return f"`{name}` needs uniform noise but `{symbol}` is `{kind}`\nhint: {symbol}=Uniform(half_widths)"
+        if not noise.known:
+            return f"`{name}` needs known half-widths but those of `{symbol}` are not\nhint: BatchLP() estimates them"
+    if not isinstance(model.x0, Box):
+        return f"`{name}` needs a box as prior but `x0` is `Normal`\nhint: x0=Box(lo, hi), or None for no bounds"
+    if model.loss is not None:
+        return f"`{name}` takes lost outputs as NaN in the record but the model has a hidden loss\nhint: loss=None"
+    if isinstance(model, Linear):
+        ends = model.theta_bounds
+        known = [] if ends is None else (np.isfinite(ends.lo) & np.isfinite(ends.hi)).tolist()
+        for k, entry in enumerate(model.theta_entries):
+            if k >= len(known) or not known[k]:
+                return (
+                    f"`{name}` needs an interval for every unknown entry but `{entry.matrix}[{entry.row}, "
+                    f"{entry.column}]` has none\nhint: theta_bounds=(lo, hi)"
+                )
+    return None
+
+
 def _whole(value: object, name: str, least: int) -> None:
     if not isinstance(value, int | np.integer) or value < least:
         raise BadValue(f"`{name}` is {value!r}, a whole number from {least} was expected")
@@ -326,17 +343,16 @@ def _recorded(model: Nonlinear) -> _Tapes | str:
     return _Tapes(g, h)
 
 
-def _turned(model: Nonlinear, y: Array, lo: Array, hi: Array) -> Array:
-    """Return outputs with angles on the turn that h may be on; NaN where that is more than one."""
-    if not model.y_angles:
-        return y
+def _turned(model: Nonlinear, y: Array, lo: Array, hi: Array) -> tuple[Array, Array]:
+    """Return both ends of the outputs, angles on the turn that h may be on; NaN where that is more than one."""
+    low, high = y.copy(), y.copy()
     assert isinstance(model.e, Uniform)
-    found = y.copy()
     for i in model.y_angles:
-        reach = np.broadcast_to(model.e.q, y.shape)[i] + 1e-12
+        reach = model.e.q[i] + 1e-12
         first, last = np.ceil((lo[i] - reach - y[i]) / _TURN), np.floor((hi[i] + reach - y[i]) / _TURN)
         if first == last:
-            found[i] = y[i] + first * _TURN
+            off = 1e-15 * abs(first * _TURN)  # a turn is no whole number of units
+            low[i], high[i] = down(y[i] + first * _TURN - off), up(y[i] + first * _TURN + off)
         elif not first > last:
-            found[i] = np.nan
-    return found
+            low[i] = high[i] = np.nan
+    return low, high

@@ -1,0 +1,288 @@
+"""Boxes of states that must contain, narrowed window by window.
+
+A window is a stretch of rows between boxes that are safe already. `Boxes.narrow` contracts them (core/box.hpp), bounds
+both sides of every wanted entry by a linear program (core/hull.hpp) and keeps whatever is tighter. The multipliers come
+from a solver that is not trusted: the bound they give is proved for any multipliers, so a wrong answer costs width only.
+Where the bound and the solver's own objective disagree, the window is asked again from the narrower boxes, and in the
+end of the stock solver.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import halfwidth._core as _core
+from halfwidth.array import Array
+from halfwidth.methods._bounds import Rows
+
+#: A bound this far from the solver's objective, in widths of the box found, is asked for again.
+LOOSE = 1e-7
+#: Above this it is reported as loose.
+_REPORT = 1e-6
+_ROUNDS = 3
+#: Most unknowns of the dense step that bounds states of an infinite box.
+_DENSE = 90
+
+
+class Empty(NamedTuple):
+    """A proof that no trajectory fits the rows a to b - 1 and the box before them.
+
+    `y` (rows, nx + ny) are the multipliers of a Farkas ray, or None where a single row leaves no box.
+    """
+
+    a: int
+    b: int
+    y: Array | None
+    row: int | None
+
+
+class Question(NamedTuple):
+    """A window and functionals to bound above: c[p]'x at state k[p] of the window."""
+
+    rows: Rows
+    lo: Array
+    hi: Array
+    c: Array
+    k: NDArray[np.int32]
+
+
+#: Proposes multipliers (functionals, rows, nx + ny) and the objective of each; neither is trusted.
+Proposer = Callable[[Question], tuple[Array, Array]]
+
+
+@dataclass(eq=False)
+class Boxes:
+    """Safe boxes lo, hi (T + 1, nx) of the states of a chain; narrowed in place.
+
+    Parameters
+    ----------
+    rows : Rows
+    lo, hi : (T + 1, nx)
+    proposers : sequence
+        Who is asked for multipliers, in turn; None is the core itself.
+    """
+
+    rows: Rows
+    lo: Array
+    hi: Array
+    proposers: Sequence[Proposer | None]
+    loose: int = 0
+    asked: int = 0
+
+    def narrow(self, a: int, b: int, states: Sequence[int]) -> Empty | None:
+        """Narrow the boxes of the window of states a to b, and fully those of the states named, by rows a to b - 1."""
+        part, lo, hi, first = self.rows.part(a, b), self.lo[a : b + 1], self.hi[a : b + 1], a
+        if not (np.isfinite(lo).all() and np.isfinite(hi).all()):
+            failed = self.finite(a, b)
+            if failed is not None:
+                return failed
+            lost = np.flatnonzero(~(np.isfinite(lo) & np.isfinite(hi)).all(axis=1))
+            if lost.size:
+                # Rows after the last unbounded state still hold all that they say of the states after it: it becomes a
+                # state that no row knows.
+                cut = int(lost[-1])
+                states = [k for k in states if k > a + cut]
+                if not states:
+                    return None
+                first, part = a + cut, part.part(cut, b - a).without_dynamics(0)
+                lo, hi = lo[cut:].copy(), hi[cut:].copy()
+                lo[0] = hi[0] = 0.0
+        c, k = sides(self.rows.nx, tuple(int(s) - first for s in states))
+        found = self._solved(Question(part, lo, hi, c, k), first)
+        if isinstance(found, Empty):
+            return found
+        lo, hi = found
+        known = 0 if first == a else 1
+        np.maximum(self.lo[first + known : b + 1], lo[known:], out=self.lo[first + known : b + 1])
+        np.minimum(self.hi[first + known : b + 1], hi[known:], out=self.hi[first + known : b + 1])
+        return None
+
+    def _solved(self, ask: Question, a: int) -> "Empty | tuple[Array, Array]":
+        """Return the boxes of a window with the sides that are asked for, asking again until they are tight."""
+        nx, kinds, T = self.rows.nx, self.rows.nx + self.rows.ny, ask.rows.T
+        lo, hi, where = ask.lo, ask.hi, ask.k[:: 2 * nx]
+        self.asked += len(ask.c)
+        best, y, value, lo, hi, bad = bounded(ask, self.proposers[0], contract=True)
+        if bad:
+            return Empty(a, a + T, None, a * kinds + bad - 1)
+        rest = [self.proposers[0]] * _ROUNDS + list(self.proposers[1:])
+        for step in range(len(rest) + 1):
+            both = best.reshape(-1, 2, nx)
+            upper, lower = both[:, 0], -both[:, 1]
+            if (lower > upper).any():
+                k, j = np.argwhere(lower > upper)[0]
+                pair = y.reshape(-1, 2, nx, T, kinds)[k, :, j]
+                return Empty(a, a + T, pair[0] + pair[1], None)
+            np.maximum(lower, lo[where], out=lower)
+            upper = np.minimum(upper, hi[where])
+            if (lower > upper).any():
+                return Empty(a, a + T, None, None)
+            lo[where], hi[where] = lower, upper
+            width, size = upper - lower, np.maximum(np.abs(lower), np.abs(upper))
+            off = (best - value).reshape(-1, 2, nx)
+            # An objective above the bound is a lie, one far below it a bad answer.
+            wrong = ~(np.abs(off) <= (LOOSE * width + 1e-13 * size)[:, None]).ravel()
+            if not wrong.any():
+                return lo, hi
+            if step == len(rest):
+                break
+            some = np.flatnonzero(wrong)
+            now = Question(ask.rows, lo, hi, np.ascontiguousarray(ask.c[some]), np.ascontiguousarray(ask.k[some]))
+            bound, new, claim, lo, hi, _ = bounded(now, rest[step], contract=False)
+            better = bound < best[some]
+            best[some[better]], y[some[better]], value[some] = bound[better], new[better], claim
+        self.loose += int(np.count_nonzero(~(np.abs(off) <= (_REPORT * width + 1e-12 * size)[:, None])))
+        return lo, hi
+
+    def functional(self, a: int, b: int, c: Array, state: int) -> tuple[float, float]:
+        """Return bounds of c'x at one state by rows a to b - 1; infinite where there is none."""
+        part, lo, hi = self.rows.part(a, b), self.lo[a : b + 1].copy(), self.hi[a : b + 1].copy()
+        k = np.full(2, state - a, dtype=np.int32)
+        best = np.full(2, np.inf)
+        for proposer in self.proposers:
+            bound, _, value, _, _, bad = bounded(Question(part, lo, hi, np.vstack((c, -c)), k), proposer, contract=False)
+            best = best if bad else np.minimum(best, bound)
+            if np.all(best - value <= LOOSE * max(float(best.sum()), 0.0) + 1e-13 * np.abs(best)):
+                break
+        return float(-best[1]), float(best[0])
+
+    def finite(self, a: int, b: int) -> Empty | None:
+        """Try to give every state of a window a finite box: by contraction, then by a left inverse of its rows."""
+        if np.isfinite(self.lo[a : b + 1]).all() and np.isfinite(self.hi[a : b + 1]).all():
+            return None
+        for again in (True, False):
+            part = self.rows.part(a, b)
+            lo, hi, bad = _core.box_contract(
+                part.E_lo, part.A_lo, part.C_lo, part.bx_lo, part.bx_hi, part.by_lo, part.by_hi,
+                np.ascontiguousarray(self.lo[a : b + 1]), np.ascontiguousarray(self.hi[a : b + 1]), 20,
+                part.E_hi, part.A_hi, part.C_hi,
+            )  # fmt: skip
+            if bad:
+                return Empty(a, b, None, a * (self.rows.nx + self.rows.ny) + bad - 1)
+            self.lo[a : b + 1], self.hi[a : b + 1] = lo, hi
+            if not again or (np.isfinite(lo).all() and np.isfinite(hi).all()):
+                return None
+            states = min(b - a, max(1, _DENSE // self.rows.nx))
+            for first in (b - states, b - states + 1):
+                if first <= b and self._enclose(first, b):
+                    break
+        return None
+
+    def _enclose(self, a: int, b: int) -> bool:
+        """Bound the states a to b by a left inverse Y of their rows; say whether that worked.
+
+        With Y M = I - R, |x| <= |Y b| + |R| |x|, so that |x| <= g / (1 - |R|) in the largest norm. R and the products
+        are computed with a bound of their rounding, (N + 2) eps times the sums of absolute values.
+        """
+        M, low, high = dense_rows(self.rows.part(a, b), self.lo[a : b + 1], self.hi[a : b + 1])
+        size = M.shape[1]
+        if len(M) < size:
+            return False
+        scale = np.abs(M).sum(axis=1)
+        scale = np.where(scale > 0, scale, 1.0)
+        Y = np.linalg.pinv(M / scale[:, None]) / scale
+        gamma = (len(M) + size + 8) * 4.5e-16
+        R = np.abs(np.eye(size) - Y @ M) + gamma * (np.abs(Y) @ np.abs(M) + np.eye(size)) + 1e-290
+        norm = R.sum(axis=1) * (1.0 + gamma)
+        if not norm.max() < 0.1:
+            return False
+        g = (np.abs(Y) @ np.maximum(np.abs(low), np.abs(high)) + 1e-290) * (1.0 + gamma)
+        reach = g.max() / (1.0 - norm.max()) * (1.0 + gamma)
+        each = ((g + norm * reach) * (1.0 + gamma)).reshape(-1, self.rows.nx)
+        if not np.isfinite(each).all():
+            return False
+        self.lo[a : b + 1] = np.maximum(self.lo[a : b + 1], -each)
+        self.hi[a : b + 1] = np.minimum(self.hi[a : b + 1], each)
+        return True
+
+
+@functools.lru_cache(maxsize=256)
+def sides(nx: int, states: tuple[int, ...]) -> tuple[Array, NDArray[np.int32]]:
+    """Return the functionals +x_j, -x_j of states of a window, and the state of each; not to be changed."""
+    c = np.tile(np.vstack((np.eye(nx), -np.eye(nx))), (len(states), 1))
+    return c, np.repeat(np.array(states, dtype=np.int32), 2 * nx)
+
+
+def bounded(
+    ask: Question, proposer: Proposer | None, *, contract: bool
+) -> tuple[Array, Array, Array, Array, Array, int]:
+    """Return proved bounds (functionals,), the multipliers, the proposed objectives, the boxes, and 1 + the row at fault."""
+    r = ask.rows
+    given = [r.E_lo, r.A_lo, r.C_lo, r.bx_lo, r.bx_hi, r.by_lo, r.by_hi]
+    last = {"E_hi": r.E_hi, "A_hi": r.A_hi, "C_hi": r.C_hi}
+    sweeps = 1 if contract else 0
+    if proposer is None:
+        bound, y, value, _, lo, hi, _, bad = _core.hull_window(
+            *given, ask.lo, ask.hi, ask.c, ask.k, sweeps=sweeps, **last
+        )
+        return bound, y, value, lo, hi, int(bad)
+    y, value = proposer(ask)
+    shape = (len(ask.c), r.T, r.nx + r.ny)
+    try:
+        y = np.ascontiguousarray(np.broadcast_to(np.asarray(y, dtype=np.float64), shape))
+        value = np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), (len(ask.c),)))
+    except (TypeError, ValueError):
+        y, value = np.zeros(shape), np.full(len(ask.c), -np.inf)
+    bound, y, _, _, lo, hi, _, bad = _core.hull_window(
+        *given, ask.lo, ask.hi, ask.c, ask.k, y=y, sweeps=sweeps, **last
+    )
+    return bound, y, value, lo, hi, int(bad)
+
+
+def stock(ask: Question) -> tuple[Array, Array]:
+    """Ask the stock linear programming solver for multipliers."""
+    from halfwidth.solvers.lp import HIGHS, Program, solve
+
+    M, low, high = sparse_rows(ask.rows)
+    nx = ask.rows.nx
+    y, value = np.zeros((len(ask.c), ask.rows.T, nx + ask.rows.ny)), np.full(len(ask.c), -np.inf)
+    seen = np.isfinite(low) & np.isfinite(high)
+    if not seen.any():
+        return y, value
+    for p, (c, k) in enumerate(zip(ask.c, ask.k, strict=True)):
+        cost = np.zeros(M.shape[1])
+        cost[k * nx : (k + 1) * nx] = -c
+        found = solve(
+            Program(cost, M[seen], low[seen], high[seen], ask.lo.ravel().copy(), ask.hi.ravel().copy()), (HIGHS,)
+        )
+        if found.z is not None:
+            y[p].reshape(-1)[seen] = -found.z
+            value[p] = -found.objective if found.solved else -np.inf
+    return y, value
+
+
+def sparse_rows(rows: Rows) -> tuple[Any, Array, Array]:
+    """Return M (K (nx + ny), (K + 1) nx) as CSR and the ends of its rows, time by time, dynamics first."""
+    import scipy.sparse as sp
+
+    K, nx, ny = rows.T, rows.nx, rows.ny
+    E, A, C = rows.middle("E"), rows.middle("A"), rows.middle("C")
+    t, i, j = (v.ravel() for v in np.meshgrid(range(K), range(nx), range(nx), indexing="ij"))
+    s, o, h = (v.ravel() for v in np.meshgrid(range(K), range(ny), range(nx), indexing="ij"))
+    row = np.concatenate((t * (nx + ny) + i, t * (nx + ny) + i, s * (nx + ny) + nx + o))
+    column = np.concatenate((t * nx + j, (t + 1) * nx + j, (s + 1) * nx + h))
+    value = np.concatenate((-A[t, i, j], E[t, i, j], C[s, o, h]))
+    M = sp.csr_array((value, (row, column)), shape=(K * (nx + ny), (K + 1) * nx))
+    M.eliminate_zeros()
+    low = np.concatenate((rows.bx_lo, rows.by_lo), axis=1).ravel()
+    high = np.concatenate((rows.bx_hi, rows.by_hi), axis=1).ravel()
+    return M, low, high
+
+
+def dense_rows(rows: Rows, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
+    """Return rows with finite ends, those of finite boxes among them: M (N, (K + 1) nx), low, high.
+
+    Interval entries are not expressed: with one, only the boxes are.
+    """
+    size = lo.size
+    box = np.isfinite(lo.ravel()) & np.isfinite(hi.ravel())
+    parts = [(np.eye(size)[box], lo.ravel()[box], hi.ravel()[box])]
+    if rows.A_hi is None and rows.C_hi is None and rows.E_hi is None and rows.T:
+        M, low, high = sparse_rows(rows)
+        there = np.isfinite(low) & np.isfinite(high)
+        parts.append((M.toarray()[there], low[there], high[there]))
+    return tuple(np.concatenate(p) for p in zip(*parts, strict=True))  # type: ignore[return-value]
