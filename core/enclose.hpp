@@ -6,7 +6,7 @@
 //     f(x) in f(m) + f'(m) (x - m) + 1/2 (x - m)' [f''](X) (x - m)        second order,
 //
 // so f(x) is within `half` of J x + k for every x in X, the smaller half-width of both taken row by row. Where neither is
-// finite (a jump, a pole, a box without ends) J is 0 and the value alone is enclosed.
+// finite (a jump, a pole, a function that bends over a box without ends) J is 0 and the value alone is enclosed.
 //
 // Moore, Kearfott and Cloud (2009), ch. 6; Combastel (2005), CDC, for the use in state bounding.
 #pragma once
@@ -24,17 +24,16 @@ inline void chain_interval(int n, Interval p, const Interval* s, Interval* d) {
         if (!is_zero(s[j])) d[j] = d[j] + p * s[j];
 }
 
-// Values, gradients (n, n_d) and, if wanted, upper triangles of Hessians (n, n_d (n_d + 1) / 2) of all slots; in: (n_in,).
+// Values, gradients (n, n_d) and, unless null, upper triangles of Hessians (n, n_d (n_d + 1) / 2) of all slots; in: (n_in,).
 inline void tape_intervals(const Tape& tape, int n_d, const Interval* in, Interval* value, Interval* slope, Interval* bend) {
     const int h = half_square(n_d);
     const Interval zero{0.0, 0.0};
     for (int k = 0; k < tape.n; ++k) {
         const int32_t* row = tape.code + 4 * k;
         const TapeOp op = (TapeOp)row[0];
-        Interval* d = slope ? slope + (std::size_t)k * n_d : nullptr;
+        Interval* d = slope + (std::size_t)k * n_d;
         Interval* dd = bend ? bend + (std::size_t)k * h : nullptr;
-        if (d)
-            for (int j = 0; j < n_d; ++j) d[j] = zero;
+        for (int j = 0; j < n_d; ++j) d[j] = zero;
         if (dd)
             for (int j = 0; j < h; ++j) dd[j] = zero;
         if (op == TapeOp::constant_) {
@@ -44,7 +43,7 @@ inline void tape_intervals(const Tape& tape, int n_d, const Interval* in, Interv
         }
         if (op == TapeOp::input_) {
             value[k] = in[row[1]];
-            if (d && row[1] < n_d) d[row[1]] = {1.0, 1.0};
+            if (row[1] < n_d) d[row[1]] = {1.0, 1.0};
             continue;
         }
         if (op == TapeOp::where_) {
@@ -52,7 +51,6 @@ inline void tape_intervals(const Tape& tape, int n_d, const Interval* in, Interv
             const bool yes = !contains(c, 0.0), no = is_zero(c);
             const int32_t a = no ? row[3] : row[2], b = yes ? row[2] : row[3];
             value[k] = hull(value[a], value[b]);
-            if (!d) continue;
             const Interval* dc = slope + (std::size_t)row[1] * n_d;
             for (int j = 0; j < n_d; ++j) {
                 d[j] = hull(slope[(std::size_t)a * n_d + j], slope[(std::size_t)b * n_d + j]);
@@ -68,7 +66,6 @@ inline void tape_intervals(const Tape& tape, int n_d, const Interval* in, Interv
         }
         const Enclosed e = enclosed(op, value[row[1]], value[row[2]]);
         value[k] = e.v;
-        if (!d) continue;
         const Interval *da = slope + (std::size_t)row[1] * n_d, *db = slope + (std::size_t)row[2] * n_d;
         const bool on_a = tape.active[row[1]], on_b = tape.active[row[2]];
         if (on_a) chain_interval(n_d, e.a, da, d);
@@ -85,9 +82,10 @@ inline void tape_intervals(const Tape& tape, int n_d, const Interval* in, Interv
     }
 }
 
+// A number of a, in the middle if a has one.
 inline double middle(Interval a) {
-    const double m = 0.5 * a.lo + 0.5 * a.hi;
-    return finite(m) ? m : 0.0;
+    if (finite(a.lo) && finite(a.hi)) return min2(max2(0.5 * a.lo + 0.5 * a.hi, a.lo), a.hi);
+    return finite(a.lo) ? a.lo : finite(a.hi) ? a.hi : 0.0;
 }
 // How far a reaches from m, rounded up.
 inline double reach(Interval a, double m) { return max2(above(m - a.lo, 2.0), above(a.hi - m, 2.0)); }
@@ -100,31 +98,29 @@ inline void tape_affine(const Tape& tape, int n_d, const Interval* in, double* J
     const int h = half_square(n_d), n = tape.n;
     Interval *value = work, *slope = value + n, *bend = slope + (std::size_t)n * n_d;
     Interval *at = bend + (std::size_t)n * h, *at_slope = at + n, *point = at_slope + (std::size_t)n * n_d;
-    bool bounded = true;
     for (int i = 0; i < tape.n_in; ++i) {
         point[i] = in[i];
         if (i < n_d) {
             const double m = middle(in[i]);
             point[i] = {m, m};
-            bounded = bounded && is_bounded(in[i]);
         }
     }
-    tape_intervals(tape, n_d, in, value, bounded ? slope : nullptr, bounded ? bend : nullptr);
-    if (bounded) tape_intervals(tape, n_d, point, at, at_slope, nullptr);
+    tape_intervals(tape, n_d, in, value, slope, bend);
+    tape_intervals(tape, n_d, point, at, at_slope, nullptr);
     for (int i = 0; i < tape.n_out; ++i) {
         const int32_t o = tape.out[i];
         v[i] = value[o];
         double* Ji = J + (std::size_t)i * n_d;
         half[i] = inf;
-        for (int order = 1; bounded && order <= 2; ++order) {
+        for (int order = 1; order <= 2; ++order) {
             // what is left of f(x) - Jt x over the box
             Interval rest = at[o];
             double Jt[64];
             for (int j = 0; j < n_d; ++j) {
                 const Interval s = order == 1 ? slope[(std::size_t)o * n_d + j] : at_slope[(std::size_t)o * n_d + j];
                 Jt[j] = is_bounded(s) ? middle(s) : 0.0;
-                const Interval r = in[j] - point[j];
-                if (!is_zero(s)) rest = rest + (s - Interval{Jt[j], Jt[j]}) * r - Interval{Jt[j], Jt[j]} * point[j];
+                if (!is_point(s)) rest = rest + (s - Interval{Jt[j], Jt[j]}) * (in[j] - point[j]);
+                rest = rest - Interval{Jt[j], Jt[j]} * point[j];
             }
             if (order == 2)
                 for (int p = 0, l = 0; p < n_d; ++p)

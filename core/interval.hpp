@@ -67,6 +67,7 @@ inline Interval operator*(Interval a, Interval b) {
 inline Interval operator*(double s, Interval a) { return Interval{s, s} * a; }
 
 inline Interval square(Interval a) {
+    if (is_zero(a)) return a;
     const double m = magnitude(a), least = contains(a, 0.0) ? 0.0 : min2(std::fabs(a.lo), std::fabs(a.hi));
     const Interval c = outward(least * least, m * m);
     return {max2(c.lo, 0.0), c.hi};

@@ -51,7 +51,7 @@ std::ptrdiff_t run_sets(const SetRun& r) {
         int bad = 0;
         for (int j = 0; j < n; j++)
             if (!(two_lo[n + j] <= two_hi[n + j])) bad = 1 + j;
-        for (int round = 0; round < 2 && !bad; round++) {
+        for (int round = 0; round < 3 && !bad; round++) {  // the last carries what the outputs said of x_ on to x
             bad = box_dynamics(b, t, two_lo, two_hi, box_work);
             if (!bad) bad = box_outputs(b, t, two_lo + n, two_hi + n, box_work);
         }
@@ -69,6 +69,9 @@ std::ptrdiff_t run_sets(const SetRun& r) {
                             two_hi + n};
         if (!bad && born >= 0.0) {
             shape.move(motion);
+            if (!shape.sound()) born = -1.0;  // numbers that are none prove nothing
+        }
+        if (!bad && born >= 0.0) {
             const std::ptrdiff_t c = b.C_t ? std::ptrdiff_t(t) * m * n : 0;
             int last = 0;
             for (int i = 0; i < m && !bad; i++) {
@@ -89,9 +92,10 @@ std::ptrdiff_t run_sets(const SetRun& r) {
             }
             // where the box is narrower it is a strip along the coordinate
             for (int j = 0; j < n; j++) own[j] = -inf, own[n + j] = inf;
-            if (!bad && !shape.meet(own, own + n)) bad = 1 + n + last;
+            if (!bad && !shape.sound()) born = -1.0;
+            if (!bad && born >= 0.0 && !shape.meet(own, own + n)) bad = 1 + n + last;
             bool folded = false;
-            for (int j = 0; j < n && !bad; j++) {
+            for (int j = 0; j < n && !bad && born >= 0.0; j++) {
                 const double width = two_hi[n + j] - two_lo[n + j];
                 if (!(width < worth * (own[n + j] - own[j]))) continue;
                 for (int l = 0; l < n; l++) h[l] = l == j;
@@ -99,8 +103,9 @@ std::ptrdiff_t run_sets(const SetRun& r) {
                 folded = folded || what == Strip::folded;
                 if (what == Strip::contradicts) bad = 1 + n + last;
             }
-            if (!bad && folded && !shape.meet(own, own + n)) bad = 1 + n + last;
-            if (!bad) {
+            if (folded && !shape.sound()) born = -1.0;
+            if (!bad && folded && born >= 0.0 && !shape.meet(own, own + n)) bad = 1 + n + last;
+            if (!bad && born >= 0.0) {
                 shape.reduce();
                 if (!shape.sound()) born = -1.0;
             }

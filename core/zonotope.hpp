@@ -522,7 +522,7 @@ struct Zonotope {
     bool sound() const {
         double s = 0.0;
         for (int i = 0; i < n; i++) {
-            s += 0.0 * c[i];
+            s += 0.0 * c[i] + 0.0 * rest[i];
             for (int j = 0; j < generators(); j++) s += 0.0 * G[std::size_t(i) * cap + j];
         }
         for (int l = 0; l < constraints(); l++) {

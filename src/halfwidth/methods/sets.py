@@ -258,19 +258,19 @@ class ConstrainedZonotopeFilter(_Recursion):
     ----------
     order : int
         Most generators a state between rows.
-    memory : int
-        Constraints kept between rows, in units of the outputs of a row.
+    constraints : int
+        Most outputs kept between rows.
     """
 
     order: int = 20
-    memory: int = 2
+    constraints: int = 6
 
     def __post_init__(self) -> None:
         _whole(self.order, "order", 1)
-        _whole(self.memory, "memory", 1)
+        _whole(self.constraints, "constraints", 1)
 
     def _sizes(self, model: Model) -> tuple[str, int, int]:
-        return "constrained", self.order * model.nx, self.memory * model.ny
+        return "constrained", self.order * model.nx, self.constraints
 
 
 @dataclass(frozen=True)
