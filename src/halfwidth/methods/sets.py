@@ -21,25 +21,21 @@ References
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
+from typing import Any
 
 import numpy as np
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.enclosure import affine
 from halfwidth.errors import BadValue, Refused, hinted
-from halfwidth.methods._bounds import Rows, down, interval_rows, one_row, up
+from halfwidth.methods._affine import motion, not_recorded, outputs
+from halfwidth.methods._bounds import Rows, interval_rows, one_row
 from halfwidth.methods._protocol import typed
-from halfwidth.model import Linear, Model, Nonlinear, arity
+from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Uniform
 from halfwidth.record import Labels, Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box
-from halfwidth.trace import Tape, Untraceable, compiled
-
-_TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,15 +72,9 @@ class _Recursion:
 
     def refuses(self, model: Model) -> str | None:
         """Return why the model cannot be taken, or None."""
-        reason = _refuses(model, type(self).__name__)
-        if reason is None and isinstance(model, Nonlinear):
-            why = _tapes(model)
-            if isinstance(why, str):
-                return (
-                    f"`{type(self).__name__}` needs `g` and `h` written with functions of NumPy but {why}\n"
-                    "hint: np.sin rather than math.sin; `ParticleFilter()` takes any function, without a guarantee"
-                )
-        return reason
+        name = type(self).__name__
+        reason = _refuses(model, name)
+        return not_recorded(model, name) if reason is None and isinstance(model, Nonlinear) else reason
 
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
         """Enclose the state at every row, from the rows up to it."""
@@ -146,18 +136,7 @@ class _Recursion:
 
     def _nonlinear(self, model: Nonlinear, state: SetState, y: Array, u: Array | None, dt: float) -> SetState:
         """One row of a nonlinear model: affine over the box before it, the outputs over the box after it."""
-        tapes = _tapes(model)
-        assert not isinstance(tapes, str)
-        assert isinstance(model.w, Uniform)
-        assert isinstance(model.e, Uniform)
-        more = (u, dt)[: arity(model.g, 3) - 1]
-        g = affine(tapes.g, state.lo, state.hi, *more)
-        half = up(g.half + model.w.q)
-        free = np.full((1, model.ny), np.inf)
-        rows = Rows(g.J, np.zeros((model.ny, model.nx)), down(g.k - half)[None], up(g.k + half)[None], -free, free)
-        inside = down(g.lo - model.w.q), up(g.hi + model.w.q)
-        if model.bounds is not None:
-            inside = np.maximum(inside[0], model.bounds.lo), np.minimum(inside[1], model.bounds.hi)
+        rows, inside = motion(model, u, dt, state.lo, state.hi)
         # The motion alone says where h is to be enclosed; what the outputs then say is where it is enclosed again.
         box = IntervalFilter()
         before = replace(state, shape=_core.sets_start("interval", model.nx, model.ny))
@@ -166,13 +145,7 @@ class _Recursion:
             return self._advance(model, state, rows, inside)[0]
         for _ in range(2):
             inside = after.lo, after.hi
-            h = affine(tapes.h, *inside)
-            half = up(h.half + model.e.q)
-            target = _turned(model, y, h.lo, h.hi)
-            by_lo, by_hi = down(down(target[0] - h.k) - half), up(up(target[1] - h.k) + half)
-            blind = np.isnan(by_lo) | np.isnan(by_hi)
-            by = np.where(blind, -np.inf, by_lo)[None], np.where(blind, np.inf, by_hi)[None]
-            after = self._advance(model, state, replace(rows, C_lo=h.J, by_lo=by[0], by_hi=by[1]), inside)[0]
+            after = self._advance(model, state, outputs(model, rows, y, *inside), inside)[0]
             if after.conflict > state.rows:
                 break
         return after
@@ -308,51 +281,3 @@ def _refuses(model: Model, name: str) -> str | None:
 def _whole(value: object, name: str, least: int) -> None:
     if not isinstance(value, int | np.integer) or value < least:
         raise BadValue(f"`{name}` is {value!r}, a whole number from {least} was expected")
-
-
-class _Tapes(NamedTuple):
-    g: Tape
-    h: Tape
-
-
-_KNOWN: WeakKeyDictionary[Nonlinear, _Tapes | str] = WeakKeyDictionary()
-
-
-def _tapes(model: Nonlinear) -> _Tapes | str:
-    """Return g and h of a model as tapes, or why they cannot be recorded."""
-    found = _KNOWN.get(model)
-    if found is None:
-        found = _KNOWN[model] = _recorded(model)
-    return found
-
-
-def _recorded(model: Nonlinear) -> _Tapes | str:
-    assert isinstance(model.x0, Box)
-    rng = np.random.default_rng(0)
-    middle = model.x0.mean
-    half = np.where(np.isfinite(model.x0.hi - model.x0.lo), 0.5 * (model.x0.hi - model.x0.lo), 1.0)
-    arguments = (np.zeros(model.nu) if model.nu else None, float(model.dt))[: arity(model.g, 3) - 1]
-    points = [middle + s * half * rng.uniform(-1.0, 1.0, model.nx) for s in (0.0, 0.3, 1.0, 1.0)]
-    name = "g"
-    try:
-        g = compiled(model.g, (model.nx, model.nu, None)[: 1 + len(arguments)], [(x, *arguments) for x in points])
-        name = "h"
-        h = compiled(model.h, (model.nx,), [(x,) for x in points])
-    except Untraceable as error:
-        return f"`{name}` cannot be recorded: {error}"
-    return _Tapes(g, h)
-
-
-def _turned(model: Nonlinear, y: Array, lo: Array, hi: Array) -> tuple[Array, Array]:
-    """Return both ends of the outputs, angles on the turn that h may be on; NaN where that is more than one."""
-    low, high = y.copy(), y.copy()
-    assert isinstance(model.e, Uniform)
-    for i in model.y_angles:
-        reach = model.e.q[i] + 1e-12
-        first, last = np.ceil((lo[i] - reach - y[i]) / _TURN), np.floor((hi[i] + reach - y[i]) / _TURN)
-        if first == last:
-            off = 1e-15 * abs(first * _TURN)  # a turn is no whole number of units
-            low[i], high[i] = down(y[i] + first * _TURN - off), up(y[i] + first * _TURN + off)
-        elif not first > last:
-            low[i] = high[i] = np.nan
-    return low, high
