@@ -98,7 +98,7 @@ struct Zonotope {
     }
     static std::size_t work(const SetSizes& z) {
         const std::size_t w = columns(z) + 4, k = rows(z);
-        return z.n * w + 4 * z.n + 3 * w + k * w + 7 * w + 5 * k;
+        return z.n * w + 4 * z.n + 3 * w + k * w + 8 * w + 5 * k;
     }
     Zonotope(const SetSizes& z, double* s, double* w)
         : n(z.n), most(z.generators), rows_most(z.kind == SetKind::constrained ? z.constraints : 0), cap(columns(z)), rows_cap(rows(z)) {
@@ -269,17 +269,24 @@ struct Zonotope {
                 t[l] = up(t[l] + off);
             }
         }
-        for (int l = 1; l <= last; l++) {
-            for (int j = 0; j <= k; j++) A[std::size_t(l - 1) * cap + j] = A[std::size_t(l) * cap + j];
-            b[l - 1] = b[l];
-            t[l - 1] = t[l];
-        }
         count[0] = k + 1;
+        drop(0);
+    }
+
+    void drop(int row) {
+        const int k = generators(), last = constraints() - 1;
+        for (int l = row; l < last; l++) {
+            for (int j = 0; j < k; j++) A[std::size_t(l) * cap + j] = A[std::size_t(l + 1) * cap + j];
+            b[l] = b[l + 1];
+            t[l] = t[l + 1];
+        }
         count[1] = last;
     }
 
     // back to `most` generators and `rows_most` constraints
     void reduce() {
+        for (int l = constraints() - 1; l >= 0; l--)  // what boxing has widened until it cuts nothing
+            if (row_sum(A + std::size_t(l) * cap) + size_of(b[l]) <= t[l]) drop(l);
         while (constraints() > rows_most) absorb();
         int k = generators();
         const int rows = constraints(), kept_most = most - n;
@@ -350,9 +357,14 @@ struct Zonotope {
     // range that its reduced cost d prefers, which is dual feasible in any basis, so each programme starts where the last ended.
     // Rows are padded with zeros to whole vectors.
 
+    struct Turn {
+        double at, weight;
+        int variable;
+    };
     struct Tableau {
-        double *T, *beta, *d, *at, *range, *limit, *cost, *y, *step;
-        int *basic, *free, *turn;
+        double *T, *beta, *d, *at, *range, *limit, *cost, *y;
+        int *basic, *free;
+        Turn* turn;
     };
     static int padded(int k) { return (k + 3) & ~3; }
     Tableau tableau() const {
@@ -365,11 +377,10 @@ struct Zonotope {
         q.d = q.y + k;
         q.at = q.d + w;
         q.range = q.at + w;
-        q.step = q.range + w;
-        q.cost = q.step + w;
-        q.basic = reinterpret_cast<int*>(q.cost + w + k);
+        q.cost = q.range + w;
+        q.turn = reinterpret_cast<Turn*>(q.cost + w + k);
+        q.basic = reinterpret_cast<int*>(q.turn + w);
         q.free = q.basic + k;
-        q.turn = q.free + w;
         return q;
     }
     void open() {
@@ -402,6 +413,40 @@ struct Zonotope {
         for (int j = 0; j < k; j += 4) *reinterpret_cast<V4u*>(out + j) -= f * *reinterpret_cast<const V4u*>(a + j);
     }
 
+    // Pass breakpoints in their order, flipping what is passed, until the slope is used up: the variable it ends at, or -1.
+    // By partition, as the middle of a list is found: which ones are passed matters, not their order.
+    static int passed(Turn* turn, int points, double slope, double* at) {
+        int from = 0, to = points;
+        while (from < to) {
+            const double x = turn[from].at, y = turn[(from + to) / 2].at, z = turn[to - 1].at;
+            const double pivot = max2(min2(x, y), min2(max2(x, y), z));
+            int m = from;
+            double weight = 0.0;
+            for (int i = from; i < to; i++) {
+                const Turn one = turn[i];
+                turn[i] = turn[m];
+                turn[m] = one;
+                m += one.at < pivot;
+                weight += one.at < pivot ? one.weight : 0.0;
+            }
+            if (m == from) {  // the pivot is the least: those equal to it, one by one
+                for (int i = from; i < to; i++) {
+                    if (turn[i].at > pivot) continue;
+                    slope -= turn[i].weight;
+                    if (slope <= 0.0) return turn[i].variable;
+                    at[turn[i].variable] = -at[turn[i].variable];
+                    turn[i] = turn[from++];
+                }
+            } else if (slope <= weight) {
+                to = m;
+            } else {
+                for (; from < m; from++) at[turn[from].variable] = -at[turn[from].variable];
+                slope -= weight;
+            }
+        }
+        return -1;
+    }
+
     // a safe bound on max s g xi
     double most_of(const double* objective, double s, bool& feasible) {
         const Tableau q = tableau();
@@ -430,29 +475,14 @@ struct Zonotope {
             // where reduced costs change sign; pass these points in order until the slope turns
             double tall = 0.0;
             for (int j = 0; j < k; j++) tall = max2(tall, size_of(row[j]));
-            int points = 0, in = -1;
+            int points = 0;
             for (int j = 0; j < k; j++) {
                 const double a = side * row[j];
                 // a variable without a range has no end to flip to, and d of either sign
-                if (a * q.at[j] < 0.0 && size_of(a) > 1e-9 * tall) {
-                    q.turn[points] = j;
-                    q.step[points++] = size_of(q.d[j] / a);
-                }
+                if (a * q.at[j] < 0.0 && size_of(a) > 1e-9 * tall)
+                    q.turn[points++] = {size_of(q.d[j] / a), 2.0 * size_of(a) * q.range[j], j};
             }
-            while (points > 0) {
-                int next = 0;
-                for (int p = 1; p < points; p++) next = q.step[p] < q.step[next] ? p : next;
-                const int j = q.turn[next];
-                slope -= 2.0 * size_of(row[j]) * q.range[j];
-                if (slope <= 0.0) {
-                    in = j;
-                    break;
-                }
-                q.at[j] = -q.at[j];
-                points--;
-                q.turn[next] = q.turn[points];
-                q.step[next] = q.step[points];
-            }
+            const int in = passed(q.turn, points, slope, q.at);
             if (in < 0) {
                 if (empty(q, out)) feasible = false;
                 break;
