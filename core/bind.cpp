@@ -15,6 +15,9 @@ void bind_enclose(nb::module_& m);
 void bind_sets(nb::module_& m);
 void bind_box(nb::module_& m);
 void bind_hull(nb::module_& m);
+void bind_constrain(nb::module_& m);
+void bind_noise(nb::module_& m);
+void bind_sampler(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -32,4 +35,7 @@ NB_MODULE(_core, m) {
     bind_sets(m);
     bind_box(m);
     bind_hull(m);
+    bind_constrain(m);
+    bind_noise(m);
+    bind_sampler(m);
 }

@@ -39,6 +39,14 @@ def test_on_the_oscillator_with_an_outage():
     assert named["ConstrainedZonotopeFilter"] < 1.2
 
 
+def test_the_guaranteed_hull_is_inside_too():
+    low, high = hw.estimate(CASE.model, CASE.record, hw.Hull(lag=0)).check().interval()
+    for m in SETS:
+        lo, hi = hw.estimate(CASE.model, CASE.record, m).interval()
+        assert np.all(lo <= low + 1e-5 * (hi - lo)), m
+        assert np.all(high <= hi + 1e-5 * (hi - lo)), m
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     seed=st.integers(0, 10**6),

@@ -25,6 +25,7 @@ ESTIMATORS: dict[str, str] = {
     "ZonotopeFilter": "sets",
     "ConstrainedZonotopeFilter": "sets",
     "EllipsoidFilter": "sets",
+    "Constrained": "constrain",
 }
 
 
