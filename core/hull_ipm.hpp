@@ -10,8 +10,10 @@
 //     -c + M'(l+ - l-) = 0,   w l = mu,    W = l+/w+ + l-/w-,    M'W M dz = c - M'(t+ - t-),
 //     t = (sigma mu - dw dl) / w - (l / w) r,     r+ = 1 - rho - w+,  r- = 1 + rho - w-  (Mehrotra 1992).
 //
-// Nothing here is trusted: core/hull.hpp bounds the functional whatever y comes out. A row without width is given a tiny
-// one, which moves y and not the bound's validity.
+// A row of next to no width is an equation rho = 0 with a free multiplier y, whose weight is a fixed number and whose
+// residual vanishes as y takes it up (a proximal step): dy = W (M dz + rho), which keeps Newton's matrix well scaled.
+//
+// Nothing here is trusted: core/hull.hpp bounds the functional whatever y comes out.
 #pragma once
 
 #include "carver.hpp"
@@ -22,6 +24,9 @@ namespace hw {
 namespace HW_ISA {
 
 constexpr double inf = __builtin_inf();
+constexpr double hull_narrow = 3e-8;  // half-width over span below which a row is an equation
+constexpr double hull_stiff = 1e8;    // its weight
+constexpr int hull_patience = 8;      // iterations without gain after which a lane stops
 
 template <int N>
 struct HullIpm {
@@ -36,11 +41,14 @@ struct HullIpm {
     bool unit;
     // the window in units of its boxes and half-widths, shared by all costs
     double *S, *E, *A, *C, *b, *scale;  // (K+1,n), (K,n,n), (K,n,n), (K,m,n), (K+1,G), (K+1,G)
-    bool* live;                         // (K+1,G) rows in use
+    double* share;                      // (K+1,G) half-width over what the row can span: of a narrow row a violation counts
+                                        // by what it means for the states
+    bool *live, *stiff;                 // (K+1,G) rows in use; those that are equations
     // per lane
     V *z, *dz, *f, *c;   // (K+1,n)
     V *w, *l, *iw, *u;   // (K+1,2G)
     V *W, *g, *d;        // (K+1,G) d = M z - b
+    V *now, *best;       // (K+1,G) -y of the iterate and of the best one, 0 for boxes
     V *L, *O;            // (K+1,n,n)
     V* work;             // 4 n
 
@@ -56,7 +64,7 @@ struct HullIpm {
         k.many(s * n, S, z, dz, f, c);
         k.many(K * nn, E, A);
         C = k.take<double>(I(K) * m * n);
-        k.many(s * G, b, scale, live, W, g, d);
+        k.many(s * G, b, scale, share, live, stiff, W, g, d, now, best);
         k.many(s * 2 * G, w, l, iw, u);
         k.many(s * nn, L, O);
         work = k.take<V>(4 * n);
@@ -73,10 +81,10 @@ struct HullIpm {
                 S[I(t) * n + j] = half > smallest ? half : smallest;
                 live[I(t) * G + j] = both;
                 b[I(t) * G + j] = 0.0;
-                scale[I(t) * G + j] = 1.0;
+                scale[I(t) * G + j] = share[I(t) * G + j] = 1.0;
             }
-        for (int k = 0; k < G; k++)
-            if (k >= n) live[k] = false;
+        for (I at = 0; at < I(K + 1) * G; at++) stiff[at] = false;
+        for (int k = n; k < G; k++) live[k] = false;
         for (int t = 0; t < K; t++) {
             const I nn = I(n) * n, mn = I(m) * n;
             const double *s0 = S + I(t) * n, *s1 = s0 + n;
@@ -106,8 +114,11 @@ struct HullIpm {
                     }
                     continue;
                 }
-                const double h = max2(0.5 * hi - 0.5 * lo, 1e-10 * reach), ih = 1.0 / h;
+                const double half = 0.5 * hi - 0.5 * lo;
+                stiff[at] = !(half > hull_narrow * reach);
+                const double h = stiff[at] ? reach : half, ih = 1.0 / h;
                 scale[at] = h;
+                share[at] = min2(1.0, h / reach);
                 b[at] = (0.5 * hi + 0.5 * lo) * ih;
                 for (int j = 0; j < n; j++) {
                     own[j] *= ih;
@@ -137,9 +148,9 @@ struct HullIpm {
         return s;
     }
 
-    // f <- sign c-part plus M'g at state t
-    inline void adjoint(int t, V* out) const {
-        const V* gt = g + I(t) * G;
+    // c + M'v at state t
+    inline void adjoint(int t, const V* v, V* out) const {
+        const V* gt = v + I(t) * G;
         for (int j = 0; j < n; j++) out[j] = c[I(t) * n + j] + gt[j];
         if (t > 0) {
             const double *Et = E + I(t - 1) * n * n, *Ct = C + I(t - 1) * m * n;
@@ -209,7 +220,7 @@ struct HullIpm {
         const I nn = I(n) * n;
         for (int t = 0; t <= K; t++) {
             V *M = L + t * nn, *ft = f + I(t) * n;
-            adjoint(t, ft);
+            adjoint(t, g, ft);
             if (factor) {
                 assemble(t);
                 if (t > 0) chain_link(n, 0, O + t * nn, M - nn, static_cast<const V*>(nullptr), M, static_cast<V*>(nullptr), work);
@@ -227,8 +238,8 @@ struct HullIpm {
                        t < K ? O + (t + 1) * nn : nullptr, t < K ? dz + I(t + 1) * n : nullptr, dz + I(t) * n);
     }
 
-    // Four costs (n each, at states k): y (K, n+m) each, the objective (minus infinity if not converged), the gap or
-    // residual reached; returns the iterations taken.
+    // Four costs (n each, at states k): y (K, n+m) each, the largest objective of a point that obeys the rows (minus
+    // infinity if none was found), its distance from the bound that y gives; returns the iterations taken.
     int solve(const double* const* cost, const int* k, int costs, double* const* y, double* value, double* gap) {
         const int kinds = n + m;
         double unit_of[P];
@@ -242,9 +253,10 @@ struct HullIpm {
         }
         int pairs = 0;
         for (I at = 0; at < I(K + 1) * G; at++) {
-            W[at] = V(live[at] ? 1.0 : 0.0);
-            g[at] = V(live[at] ? b[at] : 0.0);
-            pairs += live[at];
+            const double most = min2(1.0, 10.0 * share[at]);
+            W[at] = V(!live[at] ? 0.0 : stiff[at] ? 1e6 : most * most);
+            g[at] = live[at] ? W[at] * V(b[at]) : V(0.0);
+            pairs += live[at] && !stiff[at];
         }
         // start: least squares of all rows, without the cost
         for (I i = 0; i < I(K + 1) * n; i++) f[i] = V(0.0);
@@ -266,22 +278,39 @@ struct HullIpm {
                     continue;
                 }
                 d[at] = rho(z, t, i) - V(b[at]);
+                if (stiff[at]) {
+                    l[2 * at] = V(0.0);
+                    continue;
+                }
                 w[2 * at] = larger(V(1.0) - d[at], V(0.5));
                 w[2 * at + 1] = larger(V(1.0) + d[at], V(0.5));
                 l[2 * at] = V(first / pairs) / w[2 * at];
                 l[2 * at + 1] = V(first / pairs) / w[2 * at + 1];
             }
-        V moving = V(1.0), dres = V(1.0), reached = V(inf);
-        int iter = 0;
+        // the least bound so far, and the largest objective of a point that obeys the rows
+        V moving = V(1.0), low = V(inf), high = V(-inf);
+        for (I at = 0; at < I(K + 1) * G; at++) best[at] = V(0.0);
+        int iter = 0, since[P] = {0};
         V mu_sum = V(0.0);
         for (; iter < set.max_iter; iter++) {
-            // rows: weights, residuals, complementarity
+            // rows: weights, residuals, complementarity, and the bound that these multipliers give
             mu_sum = V(0.0);
-            V pres = V(0.0);
+            V pres = V(0.0), bound = V(0.0), value_now = V(0.0);
             for (int t = 0; t <= K; t++)
                 for (int i = 0; i < G; i++) {
                     const I at = I(t) * G + i;
-                    if (!live[at]) continue;
+                    if (!live[at]) {
+                        now[at] = V(0.0);
+                        continue;
+                    }
+                    if (stiff[at]) {
+                        now[at] = -l[2 * at];
+                        bound += V(b[at]) * l[2 * at];
+                        W[at] = V(hull_stiff);
+                        g[at] = -(l[2 * at] + V(hull_stiff) * d[at]);
+                        pres = larger(pres, magnitude(d[at]));
+                        continue;
+                    }
                     const V wp = w[2 * at], wm = w[2 * at + 1], lp = l[2 * at], lm = l[2 * at + 1];
                     const V ip = V(1.0) / wp, im = V(1.0) / wm;
                     const V dp = lp * ip, dm = lm * im, rp = V(1.0) - d[at] - wp, rm = V(1.0) + d[at] - wm;
@@ -290,16 +319,33 @@ struct HullIpm {
                     W[at] = dp + dm;
                     g[at] = dp * rp - dm * rm;
                     mu_sum += wp * lp + wm * lm;
-                    pres = larger(pres, larger(magnitude(rp), magnitude(rm)));
+                    pres = larger(pres, larger(V(0.0), magnitude(d[at]) - V(1.0)) * V(share[at]));
+                    now[at] = i < n ? V(0.0) : lm - lp;
+                    bound += magnitude(now[at]) - V(b[at]) * now[at];
                 }
-            const V merit = larger(mu_sum, larger(pres, dres));
-            reached = merit;
+            for (int t = 0; t <= K; t++) {
+                V* left = work;
+                adjoint(t, now, left);
+                for (int j = 0; j < n; j++) {
+                    bound += magnitude(left[j]);
+                    value_now += c[I(t) * n + j] * z[I(t) * n + j];
+                }
+            }
+            V better = V(-1.0);
             bool done = true;
             for (int p = 0; p < P; p++) {
-                if (!(merit[p] > set.tol)) moving.set(p, 0.0);
-                if (!(merit[p] < 1e200)) moving.set(p, 0.0);  // also not a number
+                if (moving[p] == 0.0) continue;
+                const double gap_was = low[p] - high[p];
+                if (bound[p] < low[p]) {
+                    better.set(p, 1.0);
+                    low.set(p, bound[p]);
+                }
+                if (pres[p] <= 1e-8 && value_now[p] > high[p]) high.set(p, value_now[p]);
+                since[p] = low[p] - high[p] < 0.9 * gap_was || !finite(gap_was) ? 0 : since[p] + 1;
+                if (low[p] - high[p] <= set.tol || since[p] > hull_patience || !finite(bound[p])) moving.set(p, 0.0);
                 done = done && moving[p] == 0.0;
             }
+            for (I at = 0; at < I(K + 1) * G; at++) best[at] = where_positive(better, now[at], best[at]);
             if (done) break;
             forward(true);
             backward();
@@ -308,7 +354,7 @@ struct HullIpm {
             for (int t = 0; t <= K; t++)
                 for (int i = 0; i < G; i++) {
                     const I at = I(t) * G + i;
-                    if (!live[at]) continue;
+                    if (!live[at] || stiff[at]) continue;
                     const V dd = rho(dz, t, i), rest[2] = {V(1.0) - d[at] - dd, V(1.0) + d[at] + dd};
                     for (int side = 0; side < 2; side++) {
                         const V wk = w[2 * at + side], step = rest[side] - wk;
@@ -331,7 +377,7 @@ struct HullIpm {
             for (int t = 0; t <= K; t++)
                 for (int i = 0; i < G; i++) {
                     const I at = I(t) * G + i;
-                    if (!live[at]) continue;
+                    if (!live[at] || stiff[at]) continue;
                     const V up0 = u[2 * at], um0 = u[2 * at + 1];
                     // (sigma mu - dw dl) / w = sigma mu / w - u v l, v = -1 - u
                     const V tp = target * iw[2 * at] + up0 * (V(1.0) + up0) * l[2 * at];
@@ -348,6 +394,11 @@ struct HullIpm {
                 for (int i = 0; i < G; i++) {
                     const I at = I(t) * G + i;
                     if (!live[at]) continue;
+                    if (stiff[at]) {
+                        W[at] = rho(dz, t, i);
+                        u[2 * at] = V(hull_stiff) * (W[at] + d[at]);
+                        continue;
+                    }
                     const V dd = rho(dz, t, i), rest[2] = {V(1.0) - d[at] - dd, V(1.0) + d[at] + dd};
                     for (int side = 0; side < 2; side++) {
                         const V wk = w[2 * at + side], lk = l[2 * at + side];
@@ -369,11 +420,14 @@ struct HullIpm {
                 ad.set(p, fine ? q : 0.0);
                 if (!fine) moving.set(p, 0.0);
             }
-            dres = dres * (V(1.0) - ad);
             for (I i = 0; i < I(K + 1) * n; i++) z[i] += where_positive(ap, ap * dz[i], V(0.0));
             for (I at = 0; at < I(K + 1) * G; at++) {
                 if (!live[at]) continue;
                 d[at] += where_positive(ap, ap * W[at], V(0.0));
+                if (stiff[at]) {
+                    l[2 * at] += where_positive(ad, ad * u[2 * at], V(0.0));
+                    continue;
+                }
                 for (int side = 0; side < 2; side++) {
                     w[2 * at + side] += where_positive(ap, ap * iw[2 * at + side], V(0.0));
                     l[2 * at + side] += where_positive(ad, ad * u[2 * at + side], V(0.0));
@@ -381,14 +435,14 @@ struct HullIpm {
             }
         }
         for (int p = 0; p < costs; p++) {
-            double v = 0.0;
-            for (int j = 0; j < n; j++) v += cost[p][j] * (r.mid[I(k[p]) * n + j] + S[I(k[p]) * n + j] * z[I(k[p]) * n + j][p]);
-            value[p] = reached[p] <= 1e-7 ? v : -inf;
-            gap[p] = reached[p];
+            double middle = 0.0;
+            for (int j = 0; j < n; j++) middle += cost[p][j] * r.mid[I(k[p]) * n + j];
+            value[p] = middle + unit_of[p] * high[p];
+            gap[p] = low[p] - high[p];
             for (int t = 0; t < K; t++)
                 for (int i = 0; i < kinds; i++) {
                     const I at = I(t + 1) * G + n + i;
-                    y[p][I(t) * kinds + i] = live[at] ? (l[2 * at][p] - l[2 * at + 1][p]) * unit_of[p] / scale[at] : 0.0;
+                    y[p][I(t) * kinds + i] = live[at] ? -best[at][p] * unit_of[p] / scale[at] : 0.0;
                 }
         }
         return iter;

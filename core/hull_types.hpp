@@ -31,7 +31,7 @@ struct HullRows {
 
 struct HullSettings {
     int max_iter = 60;
-    double tol = 1e-10;  // gap and residuals, in units of the box's half-width along the cost
+    double tol = 1e-10;  // gap, in units of the box's half-width along the cost
 };
 
 }  // namespace hw
