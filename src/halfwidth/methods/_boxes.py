@@ -75,40 +75,54 @@ class Boxes:
 
     def narrow(self, a: int, b: int, states: Sequence[int]) -> Empty | None:
         """Narrow the boxes of the window of states a to b, and fully those of the states named, by rows a to b - 1."""
-        part, lo, hi, first = self.rows.part(a, b), self.lo[a : b + 1], self.hi[a : b + 1], a
-        if not (np.isfinite(lo).all() and np.isfinite(hi).all()):
+        first, known = a, 0  # the window's first state, and how many states before the first that rows speak of
+        found = self._solved(self._question(a, b, states), a)
+        if found is None:
+            # Contraction alone leaves a state without a bound.
             failed = self.finite(a, b)
             if failed is not None:
                 return failed
+            lo, hi = self.lo[a : b + 1], self.hi[a : b + 1]
             lost = np.flatnonzero(~(np.isfinite(lo) & np.isfinite(hi)).all(axis=1))
             if lost.size:
                 # Rows after the last unbounded state still hold all that they say of the states after it: it becomes a
                 # state that no row knows.
-                cut = int(lost[-1])
-                states = [k for k in states if k > a + cut]
+                first, known = a + int(lost[-1]), 1
+                states = [k for k in states if k > first]
                 if not states:
                     return None
-                first, part = a + cut, part.part(cut, b - a).without_dynamics(0)
-                lo, hi = lo[cut:].copy(), hi[cut:].copy()
+            ask = self._question(first, b, states)
+            if known:
+                lo, hi = ask.lo.copy(), ask.hi.copy()
                 lo[0] = hi[0] = 0.0
-        c, k = sides(self.rows.nx, tuple(int(s) - first for s in states))
-        found = self._solved(Question(part, lo, hi, c, k), first)
+                ask = Question(ask.rows.without_dynamics(0), lo, hi, ask.c, ask.k)
+            found = self._solved(ask, first)
+        if found is None:
+            return None
         if isinstance(found, Empty):
             return found
         lo, hi = found
-        known = 0 if first == a else 1
         np.maximum(self.lo[first + known : b + 1], lo[known:], out=self.lo[first + known : b + 1])
         np.minimum(self.hi[first + known : b + 1], hi[known:], out=self.hi[first + known : b + 1])
         return None
 
-    def _solved(self, ask: Question, a: int) -> "Empty | tuple[Array, Array]":
-        """Return the boxes of a window with the sides that are asked for, asking again until they are tight."""
+    def _question(self, a: int, b: int, states: Sequence[int]) -> Question:
+        c, k = sides(self.rows.nx, tuple(int(s) - a for s in states))
+        return Question(self.rows.part(a, b), self.lo[a : b + 1], self.hi[a : b + 1], c, k)
+
+    def _solved(self, ask: Question, a: int) -> "Empty | tuple[Array, Array] | None":
+        """Return the boxes of a window with the sides that are asked for, asking again until they are tight.
+
+        None if a state stays without a bound.
+        """
         nx, kinds, T = self.rows.nx, self.rows.nx + self.rows.ny, ask.rows.T
         lo, hi, where = ask.lo, ask.hi, ask.k[:: 2 * nx]
-        self.asked += len(ask.c)
         best, y, value, lo, hi, bad = bounded(ask, self.proposers[0], contract=True)
         if bad:
             return Empty(a, a + T, None, a * kinds + bad - 1)
+        if not (np.isfinite(lo).all() and np.isfinite(hi).all()):
+            return None
+        self.asked += len(best)
         rest = [self.proposers[0]] * _ROUNDS + list(self.proposers[1:])
         for step in range(len(rest) + 1):
             both = best.reshape(-1, 2, nx)
