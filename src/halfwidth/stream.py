@@ -139,7 +139,7 @@ def _default(model: Model) -> Any:
     """Return the first recursive method that takes the model."""
     reasons = []
     defaults: tuple[tuple[str, dict[str, Any]], ...] = (
-        ("KalmanFilter", {}), ("Hull", {"memory": 10}), ("UnscentedKalman", {}), ("GPB", {}),
+        ("KalmanFilter", {}), ("Hull", {"memory": 10}), ("ZonotopeFilter", {}), ("UnscentedKalman", {}), ("GPB", {}),
     )  # fmt: skip
     for name, settings in defaults:
         method = methods.load(name)(**settings)
