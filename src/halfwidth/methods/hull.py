@@ -33,14 +33,13 @@ from numpy.typing import ArrayLike, NDArray
 from halfwidth.array import Array, of_size, real
 from halfwidth.errors import BadShape, BadValue, Refused
 from halfwidth.methods._affine import affine_rows, not_recorded
-from halfwidth.methods._bounds import Rows, ends_of, interval_rows, rows_of, theta_ends
+from halfwidth.methods._bounds import Rows, ends_of, interval_rows, not_bounded, rows_of, theta_ends
 from halfwidth.methods._boxes import Boxes, Empty, Proposer, stock
 from halfwidth.methods._conflict import Conflict, conflict_of
 from halfwidth.methods._protocol import pushed_row, typed
 from halfwidth.methods.sets import ZonotopeFilter
 from halfwidth.methods.window import window_starts
 from halfwidth.model import Linear, Model, Nonlinear
-from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box
@@ -109,31 +108,8 @@ class Hull:
                 f"`{typed(self)}` needs a linear model but the model is nonlinear"
                 "\nhint: Hull() for a whole record, ZonotopeFilter() on line"
             )
-        for name, noise in (("w", model.w), ("e", model.e)):
-            if not isinstance(noise, Uniform):
-                kind = type(noise).__name__
-                return (
-                    f"`Hull` needs bounded noise but `{name}` is `{kind}`, which may be of any size"
-                    f"\nhint: {name}=Uniform(half-widths)"
-                )
-            if not noise.known:
-                return f"`Hull` needs known half-widths but those of `{name}` are unknown\nhint: BatchLP()"
-        if not isinstance(model.x0, Box):
-            return "`Hull` needs a box as prior but `x0` is `Normal`\nhint: x0=Box(lo, hi), or None for no bounds"
-        if model.loss is not None:
-            return "`Hull` takes lost outputs as NaN in the record but the model has a hidden loss\nhint: loss=None"
-        if isinstance(model, Nonlinear):
-            return not_recorded(model, "Hull")
-        ends = model.theta_bounds
-        known = [] if ends is None else (np.isfinite(ends.lo) & np.isfinite(ends.hi)).tolist()
-        free = [entry for k, entry in enumerate(model.theta_entries) if k >= len(known) or not known[k]]
-        if free:
-            entry = free[0]
-            return (
-                f"`Hull` needs an interval for every unknown entry but `{entry.matrix}[{entry.row}, {entry.column}]` has"
-                " none\nhint: theta_bounds=(lo, hi)"
-            )
-        return None
+        reason = not_bounded(model, "Hull")
+        return not_recorded(model, "Hull") if reason is None and isinstance(model, Nonlinear) else reason
 
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
         """Bound the states of one record."""

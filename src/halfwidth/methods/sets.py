@@ -29,7 +29,7 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadValue, Refused, hinted
 from halfwidth.methods._affine import motion, not_recorded, outputs
-from halfwidth.methods._bounds import Rows, interval_rows, one_row
+from halfwidth.methods._bounds import Rows, interval_rows, not_bounded, one_row
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Uniform
@@ -73,7 +73,7 @@ class _Recursion:
     def refuses(self, model: Model) -> str | None:
         """Return why the model cannot be taken, or None."""
         name = type(self).__name__
-        reason = _refuses(model, name)
+        reason = not_bounded(model, name)
         return not_recorded(model, name) if reason is None and isinstance(model, Nonlinear) else reason
 
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
@@ -252,30 +252,6 @@ class EllipsoidFilter(_Recursion):
 
     def _sizes(self, model: Model) -> tuple[str, int, int]:  # noqa: ARG002
         return "ellipsoid", 0, 0
-
-
-def _refuses(model: Model, name: str) -> str | None:
-    """Return why a method for known half-widths cannot take a model, or None."""
-    for symbol, noise in (("w", model.w), ("e", model.e)):
-        if not isinstance(noise, Uniform):
-            kind = type(noise).__name__
-            return f"`{name}` needs uniform noise but `{symbol}` is `{kind}`\nhint: {symbol}=Uniform(half_widths)"
-        if not noise.known:
-            return f"`{name}` needs known half-widths but those of `{symbol}` are not\nhint: BatchLP() estimates them"
-    if not isinstance(model.x0, Box):
-        return f"`{name}` needs a box as prior but `x0` is `Normal`\nhint: x0=Box(lo, hi), or None for no bounds"
-    if model.loss is not None:
-        return f"`{name}` takes lost outputs as NaN in the record but the model has a hidden loss\nhint: loss=None"
-    if isinstance(model, Linear):
-        ends = model.theta_bounds
-        known = [] if ends is None else (np.isfinite(ends.lo) & np.isfinite(ends.hi)).tolist()
-        for k, entry in enumerate(model.theta_entries):
-            if k >= len(known) or not known[k]:
-                return (
-                    f"`{name}` needs an interval for every unknown entry but `{entry.matrix}[{entry.row}, "
-                    f"{entry.column}]` has none\nhint: theta_bounds=(lo, hi)"
-                )
-    return None
 
 
 def _whole(value: object, name: str, least: int) -> None:
