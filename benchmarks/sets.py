@@ -244,15 +244,16 @@ def nonlinear():
         nu=2,
         dt=0.2,
     )
-    u = np.c_[np.sin(np.arange(300) / 9), 0.4 * np.cos(np.arange(300) / 15)]
+    u = np.c_[np.sin(np.arange(200) / 9), 0.4 * np.cos(np.arange(200) / 15)]
     print(
         "\nA turning vehicle (4 states; position and a distance seen, an outage of 3 s); mean widths, microseconds a step"
     )
-    for method in (hw.IntervalFilter(), hw.EllipsoidFilter(), hw.ZonotopeFilter(), hw.ConstrainedZonotopeFilter()):
+    sets = (hw.IntervalFilter(), hw.EllipsoidFilter(), hw.ZonotopeFilter(), hw.ConstrainedZonotopeFilter())
+    for method in (*sets, hw.Hull(lag=0), hw.Hull()):
         wide, inside, times = [], [], []
         for seed in range(3):
             truth, record = hw.simulate(model, u, seed=seed)
-            record = record.without(30.0, 33.0)
+            record = record.without(20.0, 23.0)
             start = time.process_time()
             lo, hi = hw.estimate(model, record, method).interval()
             times.append(1e6 * (time.process_time() - start) / len(record))

@@ -6,10 +6,9 @@
 
 #include <cstring>
 #include <memory>
-#include <optional>
-#include <stdexcept>
 #include <string>
 
+#include "bind_box.hpp"
 #include "sets_entry.hpp"
 
 namespace nb = nanobind;
@@ -17,12 +16,9 @@ using namespace nb::literals;
 
 namespace {
 
-using Array = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
-using Maybe = std::optional<Array>;
-
-void need(bool ok, const char* what) {
-    if (!ok) throw std::invalid_argument(what);
-}
+using Array = hw::BoxArray;
+using Maybe = hw::MaybeArray;
+using hw::need;
 
 hw::SetSizes sizes(const std::string& kind, std::size_t n, std::size_t m, int generators, int constraints) {
     hw::SetSizes z{};
@@ -69,21 +65,18 @@ nb::tuple set_run(const std::string& kind, Maybe E, Array A, Array C, Array bx_l
     need(bx_hi.size() == T * n && by_hi.size() == T * m, "ends come in pairs");
     need(!bounds_lo == !bounds_hi && (!bounds_lo || (bounds_lo->size() == n && bounds_hi->size() == n)), "bounds (n,) in pairs");
     need(state.size() == HW_PICK(set_state)(r.size), "the state is of other sizes");
+    const double most[2] = {double(generators), double(constraints)};
+    const bool counted = r.size.kind == hw::SetKind::zonotope || r.size.kind == hw::SetKind::constrained;
+    for (int k = 0; k < 2 && counted && !(state.data()[1] < 0.0); k++)  // a state may come from a snapshot
+        need(state.data()[k] >= 0.0 && state.data()[k] <= most[k], "the state holds more than its sizes allow");
     hw::BoxChain& b = r.box;
     b.T = static_cast<int>(T);
     b.n = r.size.n;
     b.m = r.size.m;
-    auto matrix = [&](const Array& a, const Maybe& hi_end, std::size_t rows, const double*& l, const double*& h, bool& moving) {
-        moving = a.ndim() == 3;
-        need(a.ndim() >= 2 && a.size() == (moving ? T : 1) * rows * n, "matrices (r,n) or (T,r,n) expected");
-        need(!hi_end || hi_end->size() == a.size(), "both ends of a matrix have one shape");
-        l = a.data();
-        h = hi_end ? hi_end->data() : nullptr;
-    };
-    if (E) matrix(*E, E_hi, n, b.E_lo, b.E_hi, b.E_t);
+    if (E) hw::box_matrix(*E, E_hi, T, n, n, b.E_lo, b.E_hi, b.E_t);
     need(E || !E_hi, "both ends of a matrix have one shape");
-    matrix(A, A_hi, n, b.A_lo, b.A_hi, b.A_t);
-    matrix(C, C_hi, m, b.C_lo, b.C_hi, b.C_t);
+    hw::box_matrix(A, A_hi, T, n, n, b.A_lo, b.A_hi, b.A_t);
+    hw::box_matrix(C, C_hi, T, m, n, b.C_lo, b.C_hi, b.C_t);
     b.bx_lo = bx_lo.data();
     b.bx_hi = bx_hi.data();
     b.by_lo = by_lo.data();

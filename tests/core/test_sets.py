@@ -141,3 +141,9 @@ def test_arguments_are_judged():
         run("zonotope", **good, state=np.zeros(3), generators=10)
     with pytest.raises(ValueError, match="matrices"):
         run("interval", **{**good, "A": np.eye(3)}, state=start("interval", 2, 2))
+    for k, value in ((0, 1e9), (0, np.nan), (1, 5.0), (1, np.nan)):
+        state = start("constrained", 2, 2, 10, 4)
+        state[:2] = 2, 0
+        state[k] = value
+        with pytest.raises(ValueError, match="sizes allow"):
+            run("constrained", **good, state=state, generators=10, constraints=4)
