@@ -94,14 +94,16 @@ def series(model, rng, T):
     return x, hw.Record(np.arange(1, T + 1) * model.dt, y, u)
 
 
+KINDS = (paper003, vehicle, drawn, drawn)
 METHODS = (hw.Hull(memory=10), hw.Hull(memory=5, lag=3), hw.Hull(), hw.Hull(lag=0))
 
 
-def one(seed, T=100):
+def one(seed, T=100, method=None):
     """Run one series; return state-steps, violations, loose sides, sides, and the worst depth of a violation."""
     rng = np.random.default_rng([8, seed])
-    model, _ = (paper003, vehicle, drawn, drawn)[seed % 4](rng)
-    method = METHODS[(seed // 32) % 4] if seed % 32 >= 28 else hw.Hull(memory=5)  # the cheapest counts fastest
+    model, _ = KINDS[seed % 4](rng)
+    if method is None:
+        method = METHODS[(seed // 32) % 4] if seed % 32 >= 28 else hw.Hull(memory=5)  # the cheapest counts fastest
     x, record = series(model, rng, T)
     # A solve with E rounds, too: the noise that the simulated truth really obeys is what is declared.
     model = declared(model, x, record)

@@ -55,17 +55,14 @@ nb::object fresh(std::initializer_list<std::size_t> shape, double** data, const 
     return nb::cast(nb::ndarray<nb::numpy, double>(p, shape, owner));
 }
 
-nb::tuple hull_window(Maybe E, Array A, Array C, Array bx_lo, Array bx_hi, Array by_lo, Array by_hi, Array lo, Array hi, Array c,
-                      Index k, Maybe y, int sweeps, double tol, int max_iter, Maybe E_hi, Maybe A_hi, Maybe C_hi) {
-    need(bx_lo.ndim() == 2 && by_lo.ndim() == 2 && lo.ndim() == 2 && c.ndim() == 2,
-         "bx (K,n), by (K,m), lo (K+1,n), c (costs,n) expected");
-    const std::size_t K = bx_lo.shape(0), n = bx_lo.shape(1), m = by_lo.shape(1), costs = c.shape(0);
-    need(n >= 1 && by_lo.shape(0) == K && lo.shape(0) == K + 1 && lo.shape(1) == n && c.shape(1) == n && k.size() == costs,
-         "bx (K,n), by (K,m), lo (K+1,n), c (costs,n), k (costs) expected");
-    need(bx_hi.size() == K * n && by_hi.size() == K * m && hi.size() == lo.size(), "ends come in pairs");
-    for (std::size_t p = 0; p < costs; p++) need(k.data()[p] >= 0 && k.data()[p] <= static_cast<int>(K), "k out of range");
-    hw::HullTask task{};
-    hw::HullWindow& win = task.win;
+// The rows of a record or window from the arrays that state them.
+hw::HullWindow rows_of(const Maybe& E, const Array& A, const Array& C, const Array& bx_lo, const Array& bx_hi,
+                       const Array& by_lo, const Array& by_hi, const Maybe& E_hi, const Maybe& A_hi, const Maybe& C_hi) {
+    need(bx_lo.ndim() == 2 && by_lo.ndim() == 2, "bx (K,n), by (K,m) expected");
+    const std::size_t K = bx_lo.shape(0), n = bx_lo.shape(1), m = by_lo.shape(1);
+    need(n >= 1 && by_lo.shape(0) == K, "bx (K,n), by (K,m) expected");
+    need(bx_hi.size() == K * n && by_hi.size() == K * m, "ends come in pairs");
+    hw::HullWindow win{};
     win.K = static_cast<int>(K);
     win.n = static_cast<int>(n);
     win.m = static_cast<int>(m);
@@ -83,6 +80,19 @@ nb::tuple hull_window(Maybe E, Array A, Array C, Array bx_lo, Array bx_hi, Array
     win.bx_hi = bx_hi.data();
     win.by_lo = by_lo.data();
     win.by_hi = by_hi.data();
+    return win;
+}
+
+nb::tuple hull_window(Maybe E, Array A, Array C, Array bx_lo, Array bx_hi, Array by_lo, Array by_hi, Array lo, Array hi, Array c,
+                      Index k, Maybe y, int sweeps, double tol, int max_iter, Maybe E_hi, Maybe A_hi, Maybe C_hi) {
+    hw::HullTask task{};
+    hw::HullWindow& win = task.win;
+    win = rows_of(E, A, C, bx_lo, bx_hi, by_lo, by_hi, E_hi, A_hi, C_hi);
+    const std::size_t K = win.K, n = win.n, m = win.m;
+    need(c.ndim() == 2 && c.shape(1) == n && k.size() == c.shape(0), "c (costs,n), k (costs) expected");
+    const std::size_t costs = c.shape(0);
+    need(lo.ndim() == 2 && lo.shape(0) == K + 1 && lo.shape(1) == n && hi.size() == lo.size(), "lo, hi (K+1,n) expected");
+    for (std::size_t p = 0; p < costs; p++) need(k.data()[p] >= 0 && k.data()[p] <= win.K, "k out of range");
     nb::object box_lo = fresh({K + 1, n}, &task.lo, lo.data()), box_hi = fresh({K + 1, n}, &task.hi, hi.data());
     win.lo = task.lo;
     win.hi = task.hi;
@@ -106,6 +116,42 @@ nb::tuple hull_window(Maybe E, Array A, Array C, Array bx_lo, Array bx_hi, Array
     return nb::make_tuple(bound, ys, value, gap, box_lo, box_hi, task.iterations, code);
 }
 
+using Boxes = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+int hull_sweep(Maybe E, Array A, Array C, Array bx_lo, Array bx_hi, Array by_lo, Array by_hi, Boxes lo, Boxes hi, Index a,
+               Index b, Index k, Boxes out_lo, Boxes out_hi, int from, double loose, double least, double tol, int max_iter,
+               Maybe E_hi, Maybe A_hi, Maybe C_hi) {
+    hw::HullSweep sweep{};
+    sweep.whole = rows_of(E, A, C, bx_lo, bx_hi, by_lo, by_hi, E_hi, A_hi, C_hi);
+    const std::size_t T = sweep.whole.K, n = sweep.whole.n, tasks = a.size();
+    need(lo.shape(0) == T + 1 && lo.shape(1) == n && hi.size() == lo.size(), "lo, hi (T+1,n) expected");
+    need(b.size() == tasks && k.size() == tasks && out_lo.size() == tasks * n && out_hi.size() == tasks * n,
+         "a, b, k (tasks), out_lo, out_hi (tasks,n) expected");
+    need(from >= 0, "from out of range");
+    int longest = 0;
+    for (std::size_t i = 0; i < tasks; i++) {
+        const int first = a.data()[i], last = b.data()[i], at = k.data()[i];
+        need(first >= 0 && last <= sweep.whole.K && first <= at && at <= last, "a <= k <= b out of range");
+        longest = last - first > longest ? last - first : longest;
+    }
+    sweep.lo = lo.data();
+    sweep.hi = hi.data();
+    sweep.tasks = static_cast<int>(tasks);
+    sweep.a = a.data();
+    sweep.b = b.data();
+    sweep.k = k.data();
+    sweep.out_lo = out_lo.data();
+    sweep.out_hi = out_hi.data();
+    sweep.loose = loose;
+    sweep.least = least;
+    hw::HullSettings set;
+    set.tol = tol;
+    set.max_iter = max_iter;
+    nb::gil_scoped_release release;
+    void* work = scratch.get(HW_PICK(hull_sweep_bytes)(longest, sweep.whole.n, sweep.whole.m));
+    return HW_PICK(hull_sweep)(sweep, from, set, longest, work);
+}
+
 }  // namespace
 
 void bind_hull(nb::module_& mod) {
@@ -114,4 +160,9 @@ void bind_hull(nb::module_& mod) {
             "E_hi"_a.none() = nb::none(), "A_hi"_a.none() = nb::none(), "C_hi"_a.none() = nb::none(),
             "Bound c'x_k over a window, proved whatever the multipliers y: (bound, y, value, gap, lo, hi, iterations, code);"
             " y None: they are solved for; code > 0: row 1 + t (n+m) + i proves the window empty. See core/hull_entry.hpp.");
+    mod.def("hull_sweep", &hull_sweep, "E"_a.none(), "A"_a, "C"_a, "bx_lo"_a, "bx_hi"_a, "by_lo"_a, "by_hi"_a, "lo"_a, "hi"_a,
+            "a"_a, "b"_a, "k"_a, "out_lo"_a, "out_hi"_a, "start"_a = 0, "loose"_a = 1e-7, "least"_a = 1e-13, "tol"_a = 1e-10,
+            "max_iter"_a = 60, "E_hi"_a.none() = nb::none(), "A_hi"_a.none() = nb::none(), "C_hi"_a.none() = nb::none(),
+            "Narrow lo, hi (T+1,n) in place by the windows a..b of a record, both sides of state k each, until one is empty,"
+            " unbounded or loose; returns how many are done. See core/hull_entry.hpp.");
 }

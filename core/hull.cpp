@@ -49,5 +49,87 @@ std::ptrdiff_t hull_run(HullTask& task, const HullSettings& set, void* workspace
     return 0;
 }
 
+std::size_t hull_sweep_bytes(int longest, int n, int m) {
+    Carver c{nullptr};
+    const std::ptrdiff_t sides = 2 * n, kinds = n + m;
+    double *a, *b;
+    c.many((std::ptrdiff_t(longest) + 1) * n, a, b);
+    c.many(sides * n, a);
+    c.many(sides * longest * kinds, a);
+    c.many(sides, a, b);
+    c.many(sides, a);
+    c.take<int>(sides);
+    return c.used + 64 + hull_bytes(longest, n, m);
+}
+
+int hull_sweep(HullSweep& sweep, int from, const HullSettings& set, int longest, void* workspace) {
+    const HullWindow& all = sweep.whole;
+    const int n = all.n, m = all.m, sides = 2 * n;
+    const std::ptrdiff_t nn = std::ptrdiff_t(n) * n, mn = std::ptrdiff_t(m) * n;
+    Carver carver{static_cast<char*>(workspace)};
+    HullTask task{};
+    carver.many((std::ptrdiff_t(longest) + 1) * n, task.lo, task.hi);
+    double* c = carver.take<double>(sides * n);
+    task.y = carver.take<double>(std::ptrdiff_t(sides) * longest * (n + m));
+    carver.many(sides, task.bound, task.value);
+    task.gap = carver.take<double>(sides);
+    int* k = carver.take<int>(sides);
+    void* rest = carver.take<char>(0);
+    for (int i = 0; i < sides * n; i++) c[i] = 0.0;
+    for (int j = 0; j < n; j++) c[j * n + j] = 1.0, c[(n + j) * n + j] = -1.0;
+    task.c = c;
+    task.k = k;
+    task.costs = sides;
+    for (int one = from; one < sweep.tasks; one++) {
+        const int a = sweep.a[one], b = sweep.b[one], at = sweep.k[one] - a;
+        const std::ptrdiff_t first = std::ptrdiff_t(a) * n, count = std::ptrdiff_t(b - a + 1) * n;
+        HullWindow& win = task.win;
+        win = all;
+        win.K = b - a;
+        auto part = [&](const double*& lo, const double*& hi, bool moving, std::ptrdiff_t size) {
+            if (lo && moving) lo += a * size;
+            if (hi && moving) hi += a * size;
+        };
+        part(win.E_lo, win.E_hi, win.E_t, nn);
+        part(win.A_lo, win.A_hi, win.A_t, nn);
+        part(win.C_lo, win.C_hi, win.C_t, mn);
+        part(win.bx_lo, win.bx_hi, true, n);
+        part(win.by_lo, win.by_hi, true, m);
+        win.lo = task.lo;
+        win.hi = task.hi;
+        for (std::ptrdiff_t i = 0; i < count; i++) task.lo[i] = sweep.lo[first + i], task.hi[i] = sweep.hi[first + i];
+        for (int p = 0; p < sides; p++) k[p] = at;
+        double *lo = task.lo + std::ptrdiff_t(at) * n, *hi = task.hi + std::ptrdiff_t(at) * n;
+        bool tight = false;
+        for (int round = 0; round < 3 && !tight; round++) {  // once more from the narrower box
+            task.sweeps = round == 0;
+            if (hull_run(task, set, rest)) return one;
+            for (std::ptrdiff_t i = 0; i < count && round == 0; i++)
+                if (!finite(task.lo[i]) || !finite(task.hi[i])) return one;
+            tight = true;
+            for (int j = 0; j < n; j++) {
+                const double upper = task.bound[j], lower = -task.bound[n + j];
+                if (!(lower <= upper)) return one;
+                lo[j] = max2(lo[j], lower);
+                hi[j] = min2(hi[j], upper);
+                if (!(lo[j] <= hi[j])) return one;
+                const double slack = sweep.loose * (hi[j] - lo[j]) + sweep.least * largest_of(lo[j], hi[j]);
+                tight = tight && size_of(task.bound[j] - task.value[j]) <= slack;
+                tight = tight && size_of(task.bound[n + j] - task.value[n + j]) <= slack;
+            }
+        }
+        if (!tight) return one;
+        for (std::ptrdiff_t i = 0; i < count; i++) {
+            sweep.lo[first + i] = max2(sweep.lo[first + i], task.lo[i]);
+            sweep.hi[first + i] = min2(sweep.hi[first + i], task.hi[i]);
+        }
+        for (int j = 0; j < n; j++) {
+            sweep.out_lo[std::ptrdiff_t(one) * n + j] = lo[j];
+            sweep.out_hi[std::ptrdiff_t(one) * n + j] = hi[j];
+        }
+    }
+    return sweep.tasks;
+}
+
 }  // namespace HW_ISA
 }  // namespace hw

@@ -35,6 +35,19 @@ def up(value: Any) -> Array:
     return np.nextafter(value, np.inf)
 
 
+def below(a: Any, b: Any) -> Array:
+    """Return a number not above a + b, which is the rounded sum itself where that is not above."""
+    total = np.add(a, b)
+    part = total - a
+    error = (a - (total - part)) + (b - part)  # exactly a + b - total, Knuth's two-sum
+    return np.where(error >= 0, total, down(total))
+
+
+def above(a: Any, b: Any) -> Array:
+    """Return a number not below a + b."""
+    return -below(-np.asarray(a), -np.asarray(b))
+
+
 @dataclass(frozen=True, eq=False)
 class Rows:
     """Rows of a chain in time: ``E x[t] - A x[t-1]`` in [bx], ``C x[t]`` in [by].
@@ -124,6 +137,13 @@ class Rows:
         mid = low if high is None else 0.5 * (low + high)
         return np.broadcast_to(mid, (self.T, *mid.shape[-2:]))
 
+    def radius(self, name: str) -> Array:
+        """Return how far the entries of E, A or C (T, ., .) may be from their middles."""
+        low, high, mid = getattr(self, f"{name}_lo"), getattr(self, f"{name}_hi"), self.middle(name)
+        if high is None:
+            return np.zeros_like(mid)
+        return np.where(low == high, 0.0, np.maximum(up(high - mid), up(mid - low)))
+
 
 def not_bounded(model: Model, name: str) -> str | None:
     """Return why a method for known half-widths cannot take a model, with a hint, or None."""
@@ -180,10 +200,11 @@ def rows_of(
     lo, hi = np.zeros((T, model.nx)), np.zeros((T, model.nx))
     if "B" in pairs and u is not None:
         lo, hi = _dot(pairs["B"], u)
-    bx = down(lo - q), up(hi + q)
+    bx = below(lo, -q), above(hi, q)
     C_lo, C_hi = pairs["C"]
     if "F" not in pairs:
-        by = np.where(seen, down(y - r), -np.inf), np.where(seen, up(y + r), np.inf)
+        known = np.where(seen, y, 0.0)
+        by = np.where(seen, below(known, -r), -np.inf), np.where(seen, above(known, r), np.inf)
     else:
         C_lo, C_hi, by = _folded(pairs["F"], (C_lo, C_hi), y, seen, r)
     E = pairs.get("E", (None, None))
@@ -233,8 +254,8 @@ def _dot(matrix: tuple[Array, Array | None], u: Array) -> Pair:
     for k in range(u.shape[1]):
         p, s = low[..., k] * u[:, k, None], high[..., k] * u[:, k, None]
         some = ((low[..., k] != 0) | (high[..., k] != 0)) & (u[:, k, None] != 0)
-        lo = np.where(some, down(lo + down(np.minimum(p, s))), lo)
-        hi = np.where(some, up(hi + up(np.maximum(p, s))), hi)
+        lo = np.where(some, below(lo, down(np.minimum(p, s))), lo)
+        hi = np.where(some, above(hi, up(np.maximum(p, s))), hi)
     return lo, hi
 
 
@@ -253,7 +274,7 @@ def _folded(
     off = ((F_lo != 0) | (F_hi != 0)) & ~np.eye(ny, dtype=bool)
     known = np.where(seen, y, 0.0)
     lo, hi = _dot((F_lo, F_hi), known)
-    by_lo, by_hi = np.where(seen, down(lo - r), -np.inf), np.where(seen, up(hi + r), np.inf)
+    by_lo, by_hi = np.where(seen, below(lo, -r), -np.inf), np.where(seen, above(hi, r), np.inf)
     meets = off & seen[:, :, None] & ~seen[:, None, :]
     if not meets.any():
         return C[0], C[1], (by_lo, by_hi)

@@ -21,6 +21,7 @@ from halfwidth.methods._bounds import Rows
 
 #: A bound this far from the solver's objective, in widths of the box found, is asked for again.
 LOOSE = 1e-7
+_LEAST = 1e-13  # and this share of the state itself, which is rounding
 #: Above this it is reported as loose.
 _REPORT = 1e-6
 _ROUNDS = 3
@@ -73,10 +74,36 @@ class Boxes:
     loose: int = 0
     asked: int = 0
 
-    def narrow(self, a: int, b: int, states: Sequence[int]) -> Empty | None:
-        """Narrow the boxes of the window of states a to b, and fully those of the states named, by rows a to b - 1."""
+    def sweep(self, windows: Sequence[tuple[int, int, int]]) -> tuple[Array, Array, int, Empty | None]:
+        """Narrow the states k by windows (a, b, k), one after the other.
+
+        Returns the boxes of k as each window left them, (windows, nx) each, how many windows were done, and the proof
+        where one is empty.
+        """
+        todo = np.array(windows, dtype=np.int32).reshape(-1, 3)
+        a, b, k = (np.ascontiguousarray(column) for column in todo.T)
+        out_lo, out_hi, done = np.zeros((len(todo), self.rows.nx)), np.zeros((len(todo), self.rows.nx)), 0
+        r = self.rows
+        while done < len(todo):
+            if self.proposers[0] is None:
+                before = done
+                done = _core.hull_sweep(
+                    r.E_lo, r.A_lo, r.C_lo, r.bx_lo, r.bx_hi, r.by_lo, r.by_hi, self.lo, self.hi, a, b, k, out_lo, out_hi,
+                    done, LOOSE, _LEAST, E_hi=r.E_hi, A_hi=r.A_hi, C_hi=r.C_hi,
+                )  # fmt: skip
+                self.asked += 2 * r.nx * (done - before)
+            if done < len(todo):  # this one is not clean
+                empty = self.narrow(int(a[done]), int(b[done]), int(k[done]))
+                if empty is not None:
+                    return out_lo, out_hi, done, empty
+                out_lo[done], out_hi[done] = self.lo[k[done]], self.hi[k[done]]
+                done += 1
+        return out_lo, out_hi, done, None
+
+    def narrow(self, a: int, b: int, state: int) -> Empty | None:
+        """Narrow the boxes of the window of states a to b, and fully that of one state, by rows a to b - 1."""
         first, known = a, 0  # the window's first state, and how many states before the first that rows speak of
-        found = self._solved(self._question(a, b, states), a)
+        found = self._solved(self._question(a, b, state), a)
         if found is None:
             # Contraction alone leaves a state without a bound.
             failed = self.finite(a, b)
@@ -88,10 +115,9 @@ class Boxes:
                 # Rows after the last unbounded state still hold all that they say of the states after it: it becomes a
                 # state that no row knows.
                 first, known = a + int(lost[-1]), 1
-                states = [k for k in states if k > first]
-                if not states:
+                if state <= first:
                     return None
-            ask = self._question(first, b, states)
+            ask = self._question(first, b, state)
             if known:
                 lo, hi = ask.lo.copy(), ask.hi.copy()
                 lo[0] = hi[0] = 0.0
@@ -106,8 +132,8 @@ class Boxes:
         np.minimum(self.hi[first + known : b + 1], hi[known:], out=self.hi[first + known : b + 1])
         return None
 
-    def _question(self, a: int, b: int, states: Sequence[int]) -> Question:
-        c, k = sides(self.rows.nx, tuple(int(s) - a for s in states))
+    def _question(self, a: int, b: int, state: int) -> Question:
+        c, k = sides(self.rows.nx, state - a)
         return Question(self.rows.part(a, b), self.lo[a : b + 1], self.hi[a : b + 1], c, k)
 
     def _solved(self, ask: Question, a: int) -> "Empty | tuple[Array, Array] | None":
@@ -116,7 +142,7 @@ class Boxes:
         None if a state stays without a bound.
         """
         nx, kinds, T = self.rows.nx, self.rows.nx + self.rows.ny, ask.rows.T
-        lo, hi, where = ask.lo, ask.hi, ask.k[:: 2 * nx]
+        k = int(ask.k[0])
         best, y, value, lo, hi, bad = bounded(ask, self.proposers[0], contract=True)
         if bad:
             return Empty(a, a + T, None, a * kinds + bad - 1)
@@ -125,21 +151,18 @@ class Boxes:
         self.asked += len(best)
         rest = [self.proposers[0]] * _ROUNDS + list(self.proposers[1:])
         for step in range(len(rest) + 1):
-            both = best.reshape(-1, 2, nx)
-            upper, lower = both[:, 0], -both[:, 1]
+            upper, lower = best[:nx], -best[nx:]
             if (lower > upper).any():
-                k, j = np.argwhere(lower > upper)[0]
-                pair = y.reshape(-1, 2, nx, T, kinds)[k, :, j]
-                return Empty(a, a + T, pair[0] + pair[1], None)
-            np.maximum(lower, lo[where], out=lower)
-            upper = np.minimum(upper, hi[where])
+                j = int(np.argmax(lower > upper))
+                return Empty(a, a + T, y[j] + y[nx + j], None)
+            lower, upper = np.maximum(lower, lo[k]), np.minimum(upper, hi[k])
             if (lower > upper).any():
                 return Empty(a, a + T, None, None)
-            lo[where], hi[where] = lower, upper
+            lo[k], hi[k] = lower, upper
             width, size = upper - lower, np.maximum(np.abs(lower), np.abs(upper))
-            off = (best - value).reshape(-1, 2, nx)
             # An objective above the bound is a lie, one far below it a bad answer.
-            wrong = ~(np.abs(off) <= (LOOSE * width + 1e-13 * size)[:, None]).ravel()
+            off = np.abs(best - value)
+            wrong = ~(off <= np.tile(LOOSE * width + _LEAST * size, 2))
             if not wrong.any():
                 return lo, hi
             if step == len(rest):
@@ -149,7 +172,7 @@ class Boxes:
             bound, new, claim, lo, hi, _ = bounded(now, rest[step], contract=False)
             better = bound < best[some]
             best[some[better]], y[some[better]], value[some] = bound[better], new[better], claim
-        self.loose += int(np.count_nonzero(~(np.abs(off) <= (_REPORT * width + 1e-12 * size)[:, None])))
+        self.loose += int(np.count_nonzero(~(off <= np.tile(_REPORT * width + 10 * _LEAST * size, 2))))
         return lo, hi
 
     def functional(self, a: int, b: int, c: Array, state: int) -> tuple[float, float]:
@@ -168,6 +191,8 @@ class Boxes:
         """Try to give every state of a window a finite box: by contraction, then by a left inverse of its rows."""
         if np.isfinite(self.lo[a : b + 1]).all() and np.isfinite(self.hi[a : b + 1]).all():
             return None
+        states = far_back(self.rows.nx)
+        a = max(0, min(a, b - states))  # rows before the window may say what those in it do not
         for again in (True, False):
             part = self.rows.part(a, b)
             lo, hi, bad = _core.box_contract(
@@ -180,8 +205,7 @@ class Boxes:
             self.lo[a : b + 1], self.hi[a : b + 1] = lo, hi
             if not again or (np.isfinite(lo).all() and np.isfinite(hi).all()):
                 return None
-            states = min(b - a, max(1, _DENSE // self.rows.nx))
-            for first in (b - states, b - states + 1):
+            for first in (max(a, b - states), max(a, b - states) + 1):
                 if first <= b and self._enclose(first, b):
                     break
         return None
@@ -190,9 +214,17 @@ class Boxes:
         """Bound the states a to b by a left inverse Y of their rows; say whether that worked.
 
         With Y M = I - R, |x| <= |Y b| + |R| |x|, so that |x| <= g / (1 - |R|) in the largest norm. R and the products
-        are computed with a bound of their rounding, (N + 2) eps times the sums of absolute values.
+        are computed with a bound of their rounding; an interval entry of M adds |Y| times its radius to R.
         """
-        M, low, high = dense_rows(self.rows.part(a, b), self.lo[a : b + 1], self.hi[a : b + 1])
+        rows, box_lo, box_hi = self.rows.part(a, b), self.lo[a : b + 1].ravel(), self.hi[a : b + 1].ravel()
+        M, low, high = sparse_rows(rows)
+        box, there = np.isfinite(box_lo) & np.isfinite(box_hi), np.isfinite(low) & np.isfinite(high)
+        M = np.concatenate((np.eye(box.size)[box], M.toarray()[there]))
+        low, high = np.concatenate((box_lo[box], low[there])), np.concatenate((box_hi[box], high[there]))
+        radius = np.zeros_like(M)
+        if rows.A_hi is not None or rows.C_hi is not None or rows.E_hi is not None:
+            off = _sparse(rows.radius("A"), rows.radius("E"), rows.radius("C")).toarray()
+            radius[int(box.sum()) :] = off[there]
         size = M.shape[1]
         if len(M) < size:
             return False
@@ -200,7 +232,8 @@ class Boxes:
         scale = np.where(scale > 0, scale, 1.0)
         Y = np.linalg.pinv(M / scale[:, None]) / scale
         gamma = (len(M) + size + 8) * 4.5e-16
-        R = np.abs(np.eye(size) - Y @ M) + gamma * (np.abs(Y) @ np.abs(M) + np.eye(size)) + 1e-290
+        R = np.abs(np.eye(size) - Y @ M) + np.abs(Y) @ radius * (1.0 + gamma)
+        R = (R + gamma * (np.abs(Y) @ np.abs(M) + np.eye(size)) + 1e-290) * (1.0 + gamma)
         norm = R.sum(axis=1) * (1.0 + gamma)
         if not norm.max() < 0.1:
             return False
@@ -214,11 +247,15 @@ class Boxes:
         return True
 
 
+def far_back(nx: int) -> int:
+    """Return how many rows are looked at to bound states of an infinite box."""
+    return max(1, _DENSE // nx)
+
+
 @functools.lru_cache(maxsize=256)
-def sides(nx: int, states: tuple[int, ...]) -> tuple[Array, NDArray[np.int32]]:
-    """Return the functionals +x_j, -x_j of states of a window, and the state of each; not to be changed."""
-    c = np.tile(np.vstack((np.eye(nx), -np.eye(nx))), (len(states), 1))
-    return c, np.repeat(np.array(states, dtype=np.int32), 2 * nx)
+def sides(nx: int, state: int) -> tuple[Array, NDArray[np.int32]]:
+    """Return the functionals +x_j, -x_j of one state of a window, and the state of each; not to be changed."""
+    return np.vstack((np.eye(nx), -np.eye(nx))), np.full(2 * nx, state, dtype=np.int32)
 
 
 def bounded(
@@ -270,33 +307,26 @@ def stock(ask: Question) -> tuple[Array, Array]:
 
 
 def sparse_rows(rows: Rows) -> tuple[Any, Array, Array]:
-    """Return M (K (nx + ny), (K + 1) nx) as CSR and the ends of its rows, time by time, dynamics first."""
-    import scipy.sparse as sp
+    """Return M (K (nx + ny), (K + 1) nx) as CSR and the ends of its rows, time by time, dynamics first.
 
-    K, nx, ny = rows.T, rows.nx, rows.ny
-    E, A, C = rows.middle("E"), rows.middle("A"), rows.middle("C")
-    t, i, j = (v.ravel() for v in np.meshgrid(range(K), range(nx), range(nx), indexing="ij"))
-    s, o, h = (v.ravel() for v in np.meshgrid(range(K), range(ny), range(nx), indexing="ij"))
-    row = np.concatenate((t * (nx + ny) + i, t * (nx + ny) + i, s * (nx + ny) + nx + o))
-    column = np.concatenate((t * nx + j, (t + 1) * nx + j, (s + 1) * nx + h))
-    value = np.concatenate((-A[t, i, j], E[t, i, j], C[s, o, h]))
-    M = sp.csr_array((value, (row, column)), shape=(K * (nx + ny), (K + 1) * nx))
-    M.eliminate_zeros()
+    Interval entries are taken at their middle.
+    """
+    M = _sparse(-rows.middle("A"), rows.middle("E"), rows.middle("C"))
     low = np.concatenate((rows.bx_lo, rows.by_lo), axis=1).ravel()
     high = np.concatenate((rows.bx_hi, rows.by_hi), axis=1).ravel()
     return M, low, high
 
 
-def dense_rows(rows: Rows, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
-    """Return rows with finite ends, those of finite boxes among them: M (N, (K + 1) nx), low, high.
+def _sparse(A: Array, E: Array, C: Array) -> Any:
+    """Return the chain with A (K, nx, nx) on the states before, E and C (K, ny, nx) on those after, as CSR."""
+    import scipy.sparse as sp
 
-    Interval entries are not expressed: with one, only the boxes are.
-    """
-    size = lo.size
-    box = np.isfinite(lo.ravel()) & np.isfinite(hi.ravel())
-    parts = [(np.eye(size)[box], lo.ravel()[box], hi.ravel()[box])]
-    if rows.A_hi is None and rows.C_hi is None and rows.E_hi is None and rows.T:
-        M, low, high = sparse_rows(rows)
-        there = np.isfinite(low) & np.isfinite(high)
-        parts.append((M.toarray()[there], low[there], high[there]))
-    return tuple(np.concatenate(p) for p in zip(*parts, strict=True))  # type: ignore[return-value]
+    K, ny, nx = C.shape
+    t, i, j = (v.ravel() for v in np.meshgrid(np.arange(K), np.arange(nx), np.arange(nx), indexing="ij"))
+    s, o, h = (v.ravel() for v in np.meshgrid(np.arange(K), np.arange(ny), np.arange(nx), indexing="ij"))
+    row = np.concatenate((t * (nx + ny) + i, t * (nx + ny) + i, s * (nx + ny) + nx + o))
+    column = np.concatenate((t * nx + j, (t + 1) * nx + j, (s + 1) * nx + h))
+    value = np.concatenate((A[t, i, j], E[t, i, j], C[s, o, h]))
+    M = sp.csr_array((value, (row, column)), shape=(K * (nx + ny), (K + 1) * nx))
+    M.eliminate_zeros()
+    return M

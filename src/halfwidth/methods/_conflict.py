@@ -17,6 +17,8 @@ from halfwidth.methods._boxes import Boxes, Empty, Question, bounded, sparse_row
 
 #: A row's share of the ray below which it is not named.
 _SHARE = 1e-6
+#: A growth beyond this reconciles nothing that was meant.
+_ABSURD = 1e9
 #: Most rows that the program looks at.
 _MOST = 2000
 
@@ -127,7 +129,7 @@ def _least_growth(rows: Rows, lo: Array, hi: Array) -> tuple[float, Array, Array
         np.r_[hi.ravel(), np.inf],
     )
     answer = solve(program, (HIGHS,))
-    if not answer.solved or answer.x is None or answer.z is None:
+    if not answer.solved or answer.x is None or answer.z is None or not answer.x[-1] < _ABSURD:
         return None
     y = np.zeros(rows.T * (rows.nx + rows.ny))
     y[seen] = -(answer.z[: len(mid)] + answer.z[len(mid) :])

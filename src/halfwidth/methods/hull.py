@@ -34,7 +34,7 @@ from halfwidth.array import Array, of_size, real
 from halfwidth.errors import BadShape, BadValue, Refused
 from halfwidth.methods._affine import affine_rows, not_recorded
 from halfwidth.methods._bounds import Rows, ends_of, interval_rows, not_bounded, rows_of, theta_ends
-from halfwidth.methods._boxes import Boxes, Empty, Proposer, stock
+from halfwidth.methods._boxes import Boxes, Empty, Proposer, far_back, stock
 from halfwidth.methods._conflict import Conflict, conflict_of
 from halfwidth.methods._protocol import pushed_row, typed
 from halfwidth.methods.sets import ZonotopeFilter
@@ -206,12 +206,14 @@ def _narrowed(method: Hull, boxes: Boxes, seen: NDArray[np.bool_]) -> tuple[Arra
         reach *= 2
         wider = Boxes(boxes.rows, np.vstack((boxes.lo[:1], lo)), np.vstack((boxes.hi[:1], hi)), boxes.proposers)
         wider.lo[0], wider.hi[0] = prior
-        before = hi - lo
+        with np.errstate(invalid="ignore"):
+            before = hi - lo
         lo, hi, empty = _forward(wider, seen, reach, lag, live)
         boxes.loose, boxes.asked = boxes.loose + wider.loose, boxes.asked + wider.asked
         if empty is not None:
             break
-        live &= np.any(before - (hi - lo) > _GAIN * before, axis=1)
+        with np.errstate(invalid="ignore"):
+            live &= ~np.all(before - (hi - lo) <= _GAIN * before, axis=1)
     return lo, hi, empty
 
 
@@ -222,23 +224,23 @@ def _forward(
     T = boxes.rows.T
     out_lo, out_hi = boxes.lo[1:].copy(), boxes.hi[1:].copy()
     start = window_starts(seen, reach, fixes=_FIXES, stretch=max(reach * _STRETCH, 1))
+    windows: list[tuple[int, int, int]] = []
     for row in range(T):
-        done = [row - lag] if row >= lag else []
-        if row == T - 1:
-            done = list(range(max(0, row - lag), T))
+        done = range(max(0, row - lag), T) if row == T - 1 else [row - lag] if row >= lag else []
         if live is not None:
             done = [k for k in done if live[k]]
             if not done:
                 continue
-        states = sorted({row + 1} | {k + 1 for k in done})
         a = int(start[min(done)]) if done else 0
-        empty = boxes.narrow(a, row + 1, states)
-        if empty is not None:
-            out_lo[max(0, row - lag) :], out_hi[max(0, row - lag) :] = boxes.lo[max(0, row - lag) + 1 :], boxes.hi[max(0, row - lag) + 1 :]  # fmt: skip
-            return out_lo, out_hi, empty
-        for k in done:
-            out_lo[k], out_hi[k] = boxes.lo[k + 1], boxes.hi[k + 1]
-    return out_lo, out_hi, None
+        windows += [(a, row + 1, k + 1) for k in sorted({row, *done}, reverse=True)]
+    lo, hi, count, empty = boxes.sweep(windows)
+    for (_, b, k), low, high in zip(windows[:count], lo, hi, strict=False):
+        if b - k == lag or b == T:  # all rows that count for k were there
+            out_lo[k - 1], out_hi[k - 1] = low, high
+    if empty is not None and count < len(windows):
+        last = max(0, windows[count][2] - 1)
+        out_lo[last:], out_hi[last:] = boxes.lo[last + 1 :], boxes.hi[last + 1 :]
+    return out_lo, out_hi, empty
 
 
 def _backward(boxes: Boxes, seen: NDArray[np.bool_], reach: int) -> Empty | None:
@@ -249,12 +251,16 @@ def _backward(boxes: Boxes, seen: NDArray[np.bool_], reach: int) -> Empty | None
         longest = max(reach * _STRETCH, 1)
         start = window_starts(seen, reach, fixes=_FIXES, stretch=longest)
         stop = T - window_starts(seen[::-1], reach, fixes=_FIXES, stretch=longest)[::-1]
-        before = boxes.hi - boxes.lo
-        for k in np.flatnonzero(live)[::-1].tolist():
-            a, b = (int(start[k - 1]) if k else 0), (int(stop[k]) if k < T else T)
-            empty = boxes.narrow(a, b, [k])
-            if empty is not None:
-                return empty
+        with np.errstate(invalid="ignore"):
+            before = boxes.hi - boxes.lo
+        empty = boxes.sweep(
+            [
+                (int(start[k - 1]) if k else 0, int(stop[k]) if k < T else T, k)
+                for k in np.flatnonzero(live)[::-1].tolist()
+            ]
+        )[3]
+        if empty is not None:
+            return empty
         if reach >= T:
             return None
         with np.errstate(invalid="ignore"):
@@ -422,22 +428,20 @@ class _Live:
         self.pushed += 1
         if self.empty is not None:
             return self._infeasible(self.empty)
-        self.rows = rows
-        self.times.append(t)
-        self.seen = np.vstack((self.seen, ~np.isnan(row)))
-        lag, newest = 0 if self.hull.lag is None else int(self.hull.lag), len(self.times) - 1
+        times, seen = [*self.times, t], np.vstack((self.seen, ~np.isnan(row)))
+        lag, newest = 0 if self.hull.lag is None else int(self.hull.lag), len(times) - 1
         wanted = max(newest - lag, 0)
-        start = self._starts(self.seen)
+        start = self._starts(seen)
         boxes = Boxes(rows, np.vstack((self.lo, self.free[0])), np.vstack((self.hi, self.free[1])), _PROPOSERS)
         given = boxes.lo.copy(), boxes.hi.copy()
         done = [wanted] if self.pushed > lag else []
         a = int(start[wanted]) if done else 0
-        empty = boxes.narrow(a, newest + 1, sorted({newest + 1} | {k + 1 for k in done}))
+        empty = boxes.sweep([(a, newest + 1, k + 1) for k in sorted({newest, *done}, reverse=True)])[3]
         if empty is not None:
             names = (_names(model.names.x, "x", model.nx), _names(model.names.y, "y", model.ny))
-            self.empty = conflict_of(rows, *given, np.array(self.times), empty, names).message
+            self.empty = conflict_of(rows, *given, np.array(times), empty, names).message
             return self._infeasible(self.empty)
-        self.lo, self.hi = boxes.lo, boxes.hi
+        self.rows, self.times, self.seen, self.lo, self.hi = rows, times, seen, boxes.lo, boxes.hi
         state = wanted + 1
         box = Box(self.lo[state : state + 1].copy(), self.hi[state : state + 1].copy(), guaranteed=True)
         when = np.array([self.times[wanted]])
@@ -456,7 +460,7 @@ class _Live:
         rows = self._with(row, inputs, self.t + step, step)
         boxes = Boxes(rows, np.vstack((self.lo, self.free[0])), np.vstack((self.hi, self.free[1])), _PROPOSERS)
         last = rows.T
-        boxes.narrow(max(0, last - int(self.hull.memory or last)), last, [last])
+        boxes.narrow(max(0, last - int(self.hull.memory or last)), last, last)
         return Bound(*boxes.functional(0, last, c, last))
 
     def _with(self, y: Array, u: Array | None, t: float, dt: float) -> Rows:
@@ -475,7 +479,9 @@ class _Live:
         return window_starts(seen, memory, fixes=_FIXES, stretch=memory * _STRETCH)
 
     def _forget(self, a: int) -> None:
-        """Drop what lies before the window: starts never move back."""
+        """Drop what lies before the window: starts never move back, but for states without a bound."""
+        if not (np.isfinite(self.lo[a:]).all() and np.isfinite(self.hi[a:]).all()):
+            a = min(a, max(0, len(self.times) - far_back(self.model.nx)))
         if a > 0 and self.rows is not None:
             self.rows = self.rows.part(a, self.rows.T)
             self.lo, self.hi, self.seen = self.lo[a:], self.hi[a:], self.seen[a:]
