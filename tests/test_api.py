@@ -8,11 +8,11 @@ import halfwidth as hw
 
 NAMES = """
 BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Both Bound Box Cloud Constrained
-DataQualityWarning Estimate Estimator ExtendedKalman FearnheadClifford GPB Gaussian Halfspaces HalfwidthError Hull
-KalmanFilter KalmanSmoother Learned Linear LogTooBig Markov MemoryChoice Missing Mixed MixedFilter MixedWindow
-Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls SequentialLP Status Uniform UnscentedKalman
-Unsolved Window __version__ bound choose_memory ensemble_interval estimate forecast from_continuous learn resume
-score simulate stream
+ConstrainedZonotopeFilter DataQualityWarning EllipsoidFilter Estimate Estimator ExtendedKalman FearnheadClifford GPB
+Gaussian Halfspaces HalfwidthError Hull IntervalFilter KalmanFilter KalmanSmoother Learned Linear LogTooBig Markov
+MemoryChoice Missing Mixed MixedFilter MixedWindow Nonlinear Normal ParticleFilter RBPF Record Recursive Refused
+Runnalls SequentialLP Status Uniform UnscentedKalman Unsolved Window ZonotopeFilter __version__ bound choose_memory
+ensemble_interval estimate forecast from_continuous learn resume score simulate stream
 """
 
 

@@ -24,6 +24,10 @@ ESTIMATORS: dict[str, str] = {
     "Constrained": "constrain",
     "MixedFilter": "mixed",
     "MixedWindow": "mixed_window",
+    "IntervalFilter": "sets",
+    "ZonotopeFilter": "sets",
+    "ConstrainedZonotopeFilter": "sets",
+    "EllipsoidFilter": "sets",
 }
 
 

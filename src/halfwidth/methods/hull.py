@@ -9,6 +9,9 @@ is a row left out. Whatever solver runs, what is reported is the dual bound of N
 accounted for (core/hull.hpp): a poor answer loosens it by its own error and cannot put it inside the truth. Data that
 contradict the bounds are a certified `Status.INFEASIBLE` that names rows and times, never a bound.
 
+A nonlinear model is taken where `g` and `h` can be recorded: over boxes that a cheap set found they are affine functions
+with a proved distance (`halfwidth.enclosure`), which widens the noise; the box is then safe and near the least.
+
 An entry of A, B, C, E or F known only to an interval is NaN with ``theta_bounds``. It may be another number at every
 row; its product with a state is bounded over the state's box, so the answer contains and is no longer the least.
 
@@ -29,13 +32,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from halfwidth.array import Array, of_size, real
 from halfwidth.errors import BadShape, BadValue, Refused
-from halfwidth.methods._bounds import Rows, ends_of, interval_rows, rows_of, theta_ends
+from halfwidth.methods._affine import affine_rows, not_recorded
+from halfwidth.methods._bounds import Rows, ends_of, interval_rows, not_bounded, rows_of, theta_ends
 from halfwidth.methods._boxes import Boxes, Empty, Proposer, far_back, stock
 from halfwidth.methods._conflict import Conflict, conflict_of
 from halfwidth.methods._protocol import pushed_row, typed
+from halfwidth.methods.sets import ZonotopeFilter
 from halfwidth.methods.window import window_starts
-from halfwidth.model import Linear, Model
-from halfwidth.noise import Uniform
+from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box
@@ -44,6 +48,9 @@ from halfwidth.spread import Box
 _FIXES, _STRETCH = 2, 10
 #: Without a memory, the first reach of a window; it doubles until a state gains less than _GAIN of its width.
 _REACH, _GAIN = 10, 1e-5
+
+#: Times that a nonlinear model is replaced by affine rows.
+_AFFINE = 2
 
 _PROPOSERS: tuple[Proposer | None, ...] = (None, stock)
 
@@ -96,33 +103,15 @@ class Hull:
 
     def refuses(self, model: Model) -> str | None:
         """Return why nothing can be guaranteed on the model, or None."""
-        if not isinstance(model, Linear):
-            return "`Hull` needs a linear model but the model is nonlinear\nhint: UnscentedKalman()"
-        for name, noise in (("w", model.w), ("e", model.e)):
-            if not isinstance(noise, Uniform):
-                kind = type(noise).__name__
-                return (
-                    f"`Hull` needs bounded noise but `{name}` is `{kind}`, which may be of any size"
-                    f"\nhint: {name}=Uniform(half-widths)"
-                )
-            if not noise.known:
-                return f"`Hull` needs known half-widths but those of `{name}` are unknown\nhint: BatchLP()"
-        if not isinstance(model.x0, Box):
-            return "`Hull` needs a box as prior but `x0` is `Normal`\nhint: x0=Box(lo, hi), or None for no bounds"
-        if model.loss is not None:
-            return "`Hull` takes lost outputs as NaN in the record but the model has a hidden loss\nhint: loss=None"
-        ends = model.theta_bounds
-        known = [] if ends is None else (np.isfinite(ends.lo) & np.isfinite(ends.hi)).tolist()
-        free = [entry for k, entry in enumerate(model.theta_entries) if k >= len(known) or not known[k]]
-        if free:
-            entry = free[0]
+        if isinstance(model, Nonlinear) and self.memory is not None:
             return (
-                f"`Hull` needs an interval for every unknown entry but `{entry.matrix}[{entry.row}, {entry.column}]` has"
-                " none\nhint: theta_bounds=(lo, hi)"
+                f"`{typed(self)}` needs a linear model but the model is nonlinear"
+                "\nhint: Hull() for a whole record, ZonotopeFilter() on line"
             )
-        return None
+        reason = not_bounded(model, "Hull")
+        return not_recorded(model, "Hull") if reason is None and isinstance(model, Nonlinear) else reason
 
-    def run(self, model: Linear, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
+    def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
         """Bound the states of one record."""
         return run(self, model, record)
 
@@ -140,12 +129,33 @@ class Hull:
 
 
 def run(
-    method: Hull, model: Linear, record: Record, proposers: Sequence[Proposer | None] = _PROPOSERS
+    method: Hull, model: Model, record: Record, proposers: Sequence[Proposer | None] = _PROPOSERS
 ) -> Estimate:
     """Bound the states of a record with the given proposers of multipliers, none of which is trusted."""
-    T, nx = len(record), model.nx
-    rows = interval_rows(model, record)
-    lo, hi = outer(model, T)
+    lo, hi = outer(model, len(record))
+    if isinstance(model, Linear):
+        return _bounded(method, model, record, interval_rows(model, record), lo, hi, proposers)
+    # Affine rows over the boxes of a cheap set, and once more over those that they give.
+    est = ZonotopeFilter().run(model, record)
+    for _ in range(_AFFINE):
+        if not est.status.good:
+            return dataclasses.replace(est, method=typed(method))
+        lo[1:], hi[1:] = est.interval()
+        est = _bounded(method, model, record, affine_rows(model, record, lo, hi), lo, hi, proposers)
+    return est
+
+
+def _bounded(
+    method: Hull,
+    model: Model,
+    record: Record,
+    rows: Rows,
+    lo: Array,
+    hi: Array,
+    proposers: Sequence[Proposer | None],
+) -> Estimate:
+    """Bound the states by rows, from boxes (T + 1, nx) that are safe already."""
+    nx = model.nx
     boxes = Boxes(rows, lo.copy(), hi.copy(), proposers)
     out_lo, out_hi, empty = _narrowed(method, boxes, record.seen)
     info: dict[str, Any] = {"loose": boxes.loose, "sides": boxes.asked, "x0_lo": boxes.lo[0], "x0_hi": boxes.hi[0]}
@@ -169,7 +179,7 @@ def run(
     )  # fmt: skip
 
 
-def outer(model: Linear, T: int) -> tuple[Array, Array]:
+def outer(model: Model, T: int) -> tuple[Array, Array]:
     """Return what is known of the states x_0 .. x_T without any row, each (T + 1, nx)."""
     assert isinstance(model.x0, Box)
     lo, hi = np.full((T + 1, model.nx), -np.inf), np.full((T + 1, model.nx), np.inf)
@@ -352,6 +362,8 @@ def bound(model: Linear, record: Record, c: ArrayLike, *, at: int | None = None)
     from halfwidth.estimate import choose, fits
 
     method = Hull()
+    if not isinstance(model, Linear):
+        raise Refused("`bound` needs a linear model but the model is nonlinear", hint="estimate(model, record, Hull())")
     choose(model, method)
     fits(model, record)
     row = _functional(c, model.nx)
