@@ -37,8 +37,8 @@ _HOME: dict[str, str] = {
     "resume": "stream",
     "forecast": "forecast",
     "ensemble_interval": "methods.window",
-    "choose_memory": "methods.window",
-    "MemoryChoice": "methods.window",
+    "choose_memory": "methods.memory",
+    "MemoryChoice": "methods.memory",
     "learn": "learn",
     "Learned": "learn",
     "HalfwidthError": "errors",
@@ -87,13 +87,13 @@ if TYPE_CHECKING:
     from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
     from halfwidth.methods.loss import Runnalls as Runnalls
     from halfwidth.methods.map import BatchLP as BatchLP
+    from halfwidth.methods.memory import MemoryChoice as MemoryChoice
+    from halfwidth.methods.memory import choose_memory as choose_memory
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
     from halfwidth.methods.sequential import SequentialLP as SequentialLP
-    from halfwidth.methods.window import MemoryChoice as MemoryChoice
     from halfwidth.methods.window import Window as Window
-    from halfwidth.methods.window import choose_memory as choose_memory
     from halfwidth.methods.window import ensemble_interval as ensemble_interval
     from halfwidth.model import Linear as Linear
     from halfwidth.model import Nonlinear as Nonlinear

@@ -36,7 +36,10 @@ from halfwidth.varying import Varying
 
 Point = Literal["central", "optimal", "least_squares"]
 POINTS: dict[str, int] = {"optimal": 0, "central": 1, "least_squares": 2}
-_STATUS = (Status.OK, Status.REDUCED, Status.INFEASIBLE, Status.STALLED)
+#: What the core's codes mean.
+STATUSES = (Status.OK, Status.REDUCED, Status.INFEASIBLE, Status.STALLED)
+#: A well-centred iterate: x (T + 1, nx), theta, s, multipliers of rows, of boxes, of the ends of theta and s.
+Start = tuple[Array, Array, Array, Array, Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +173,7 @@ class Answer(NamedTuple):
     """What was found: x (T + 1, nx), theta (p0,), s (ns,), multipliers (T, nx + ny, 2), and how it went.
 
     `objective` is ``c's``; `gap` its distance from the dual objective, relative; `scale` the size of the residuals at
-    the least-squares start; `by` the solver.
+    the least-squares start; `by` the solver; `start` where a similar program may begin.
     """
 
     x: Array
@@ -184,6 +187,7 @@ class Answer(NamedTuple):
     iterations: int
     scale: float
     by: str
+    start: Start | None = None
 
 
 def solve(
@@ -195,6 +199,9 @@ def solve(
     max_iter: int = 100,
     multipliers: bool = False,
     fallback: bool = True,
+    start: Start | None = None,
+    drop: int = 0,
+    keep: bool = False,
 ) -> Answer:
     """Solve the program.
 
@@ -211,6 +218,12 @@ def solve(
         Return them too, in units of cost by residual.
     fallback : bool
         Ask the stock solvers where the core does not certify its answer.
+    start : Start, optional
+        Where an optimal point may begin: the `start` of a program of the same sizes that began `drop` rows earlier. The
+        optimum does not depend on it; where it leads nowhere the program is solved from least squares.
+    drop : int
+    keep : bool
+        Return a `start` for the next program.
 
     Returns
     -------
@@ -218,11 +231,14 @@ def solve(
         Its status is OK only with a relative gap of at most 1e-8 (or `central_gap`); INFEASIBLE only with a proof.
     """
     c = chain
-    x, theta, s, lam, slack, info = lp_solve(*_arrays(c), POINTS[point], tol, central_gap, max_iter, multipliers)
-    status = _STATUS[info["status"]]
-    answer = Answer(
-        x, theta, s, lam, slack, status, info["objective"], info["gap"], info["iterations"], info["scale"], "banded"
+    x, theta, s, lam, slack, info = lp_solve(
+        *_arrays(c), POINTS[point], tol, central_gap, max_iter, multipliers, start, drop, keep
     )
+    status = STATUSES[info["status"]]
+    answer = Answer(
+        x, theta, s, lam, slack, status, info["objective"], info["gap"], info["iterations"], info["scale"], "banded",
+        info["start"],
+    )  # fmt: skip
     if status is Status.OK or not fallback:
         return answer
     if status is Status.REDUCED and c.T > 5000:
@@ -239,6 +255,7 @@ def _arrays(c: Chain) -> tuple[Any, ...]:
 
 def _proved(chain: Chain, answer: Answer) -> Answer:
     """Return the stock solvers' answer, or the structured one's if they have none that is better."""
+    answer = answer._replace(start=None)
     found = proved(chain.program(), (PIQP, HIGHS))
     if found.verdict is Verdict.INFEASIBLE:
         return answer._replace(status=Status.INFEASIBLE, by=found.solver)
