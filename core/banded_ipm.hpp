@@ -97,7 +97,7 @@ struct BandedIpm : Shape<N, Y> {
     // the dense end: z = (theta, s), its bounds as pairs, its Schur complement, the chain of separators
     double *sx, *kappa, *cz, *sz, *z, *dz, *zref, *kz, *zbest, *zlo, *zhi, *zw, *zl, *zu, *zv, *ze, *zrp, *zlbest, *zwarm, *zlwarm;
     double *Kd, *KL, *Kpiv, *Kinv, *Korig, *zcg, *pz, *rM, *rO, *rZ, *rQ, *rf, *rx, *racc, *rw, *hmax, *count;
-    double S, reg, drop, mu_pairs;
+    double S, reg, drop, mu_pairs, rounding;  // what the largest state leaves of a residual, in units S
     double objective, comp, dinf, pinf, dual;  // of the current iterate, set by `assemble`
 
     BandedIpm(const LpProblem& lp_, const LpSettings& set_)
@@ -700,6 +700,7 @@ struct BandedIpm : Shape<N, Y> {
         S = max_lanes(top);
         objective = comp = 0.0;
         if (!(S > 1e-12 * biggest) || S < 1e-290) return false;
+        rounding = 4e-15 * biggest / S;
         const V over(1.0 / S);
         for (I i = 0; i < H; i++) {
             for (int j = 0; j < rows; j++) b[i * rows + j] *= over;
@@ -1205,7 +1206,7 @@ struct BandedIpm : Shape<N, Y> {
             if (step) dense_take(ap, ad);
             assemble(ap, ad, step, true);
             step = true;
-            const double size = std::fabs(objective) + 1e-6 + free_cost;
+            const double size = std::fabs(objective) + 1e-6 + free_cost + (set.point == lp_central ? 0.0 : rounding / set.tol);
             const double slip = (dinf - promised) / size;  // what the last direction's dual residual lacks
             const double gap = comp / size, worst = max2(gap, max2(dinf / size, pinf / size));
             const double merit = comp + dinf + pinf < 1e300 ? worst : 1e300;  // NaN is no merit

@@ -78,7 +78,7 @@ struct LpWindows {
     double *low, *high;  // (T+1, n)  least and largest estimate of each state by those windows
     int* status;         // (T)
     int* iterations;     // (T)
-    double* seconds;     // (T)
+    double* seconds;     // (T) CPU time
     double* scratch;     // (longest window + 1) n + 2 n
     LpWarm* warm;        // of the longest window, if the settings ask for it
 };

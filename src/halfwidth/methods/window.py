@@ -1,18 +1,25 @@
 """Window: any batch method on a sliding window of the record, one estimate a row.
 
 At row t the method sees rows ``start(t)`` to t only, so the cost of a row does not grow and old data are forgotten. A
-window holds ``memory + 1`` rows, and **stretches**: it reaches further back until every output that is ever seen has
-``fixes`` seen entries in it, so that during and after an outage longer than the memory the window still holds a fix
-on the far side. A row whose window ends in unseen outputs **extrapolates**; ``info["extrapolated"]`` says so.
+window holds the newest ``memory + 1`` rows in which anything is seen: it **stretches** over a gap, and reaches further
+back until every output that is ever seen has ``fixes`` seen entries in it. A row in which nothing is seen says nothing
+new: the estimate moves on along the model, which ``info["extrapolated"]`` says, and the first fix after an outage of any
+length meets as many rows on its far side as the memory holds.
+
+An optimal point (``BatchLP(point="optimal")``) begins at a well-centred iterate of the window before, moved by a row:
+the optimum is the same within its tolerance, in fewer steps. A central point begins afresh in every window: it is where
+the path from least squares stops, so a start elsewhere would make it depend on history.
 
 Every state is estimated by several windows. The paper takes the least and the largest of these estimates, s_lo and
 s_hi, for its interval
 
     mu +- kappa rho,    mu = (s_hi + s_lo) / 2,    rho = n / (n - 2) (s_hi - s_lo) / 2          (27)-(31)
 
-with n + 1 the number of estimates; `ensemble_interval` returns it. Its kappa has no calibrated level: use
-``Posterior`` where a probability is wanted. With ``carry=kappa`` the interval of the state that has just left the
-window bounds the first state of the next one.
+with n + 1 the number of estimates; `ensemble_interval` returns it. States in a gap count the windows until ``memory``
+rows after its end, since those inside it all miss the same. On line the windows up to now are carried on by the model
+to the newest row, and an outage adds what their half-widths can add up to. Kappa has no calibrated level: use
+``Posterior`` where a probability is wanted. With ``carry=kappa`` the interval of the state that has just left the window
+bounds the first state of the next one.
 
 References
 ----------
@@ -71,8 +78,10 @@ class Window:
     -----
     ``x[k]`` is the newest state of the window that ends at row k. In ``info``: ``smoothed`` (T, nx), the last
     estimate of each state; ``low``, ``high`` and ``windows``, what `ensemble_interval` needs; ``q``, ``r``, ``theta``
-    of every window; ``start``, ``extrapolated``, ``statuses`` of every row. Those of the estimate
-    itself are the last window's; its status is the worst of all windows.
+    of every window; ``start``, ``extrapolated``, ``since_fix``, ``statuses``, ``iterations`` and, of ``BatchLP``,
+    ``seconds`` of CPU time of every row; ``newest_low``, ``newest_high``, ``newest_windows``, what
+    ``ensemble_interval(newest=True)`` needs. Those of the estimate itself are the last window's; its status is the worst
+    of all windows.
 
     Raises
     ------
