@@ -39,10 +39,10 @@ _HOME: dict[str, str] = {
     "resume": "stream",
     "forecast": "forecast",
     "ensemble_interval": "methods.window",
-    "choose_memory": "methods.window",
     "bound": "methods.hull",
     "Bound": "methods.hull",
-    "MemoryChoice": "methods.window",
+    "choose_memory": "methods.memory",
+    "MemoryChoice": "methods.memory",
     "learn": "learn",
     "Learned": "learn",
     "HalfwidthError": "errors",
@@ -97,6 +97,8 @@ if TYPE_CHECKING:
     from halfwidth.methods.map import BatchLP as BatchLP
     from halfwidth.methods.mixed import MixedFilter as MixedFilter
     from halfwidth.methods.mixed_window import MixedWindow as MixedWindow
+    from halfwidth.methods.memory import MemoryChoice as MemoryChoice
+    from halfwidth.methods.memory import choose_memory as choose_memory
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
@@ -105,9 +107,7 @@ if TYPE_CHECKING:
     from halfwidth.methods.sets import EllipsoidFilter as EllipsoidFilter
     from halfwidth.methods.sets import IntervalFilter as IntervalFilter
     from halfwidth.methods.sets import ZonotopeFilter as ZonotopeFilter
-    from halfwidth.methods.window import MemoryChoice as MemoryChoice
     from halfwidth.methods.window import Window as Window
-    from halfwidth.methods.window import choose_memory as choose_memory
     from halfwidth.methods.window import ensemble_interval as ensemble_interval
     from halfwidth.model import Linear as Linear
     from halfwidth.model import Nonlinear as Nonlinear

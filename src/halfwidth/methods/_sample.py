@@ -25,7 +25,7 @@ from halfwidth.array import Array, generator
 from halfwidth.methods._residuals import Residuals, reference, residuals
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.sequential import SequentialLP, filled
-from halfwidth.model import Linear, Model
+from halfwidth.model import Linear, Model, needs_a_box
 from halfwidth.noise import Gaussian, Noise, Uniform
 from halfwidth.record import Record
 from halfwidth.spread import Box, Normal
@@ -63,6 +63,8 @@ def refuses(model: Model) -> str | None:
     """Return why a model cannot be sampled, or None."""
     if not isinstance(model, Linear):
         return "the sampler needs a linear model but the model is nonlinear\nhint: the posterior by linearisation"
+    if (reason := needs_a_box(model, "the sampler")) is not None:
+        return reason
     for name, noise in (("w", model.w), ("e", model.e)):
         if not isinstance(noise, Uniform | Gaussian):
             return (
@@ -316,7 +318,8 @@ def _rows(model: Linear, record: Record) -> _Rows:
     back = np.argsort(order)
     M = sp.csr_array(M[:, order])
     M.sort_indices()
-    box = model.bounds or Box(np.full(nx, -np.inf), np.full(nx, np.inf))
+    free = Box(np.full(nx, -np.inf), np.full(nx, np.inf))
+    box = model.bounds if isinstance(model.bounds, Box) else free
     prior = model.x0 if isinstance(model.x0, Box) else Box(np.full(nx, -np.inf), np.full(nx, np.inf))
     lo = np.r_[prior.lo, np.tile(box.lo, T), np.full(tl.size, -np.inf)][order]
     hi = np.r_[prior.hi, np.tile(box.hi, T), np.full(tl.size, np.inf)][order]
