@@ -9,7 +9,7 @@ from tests.cases import CASES, constant_velocity, oscillator
 
 import halfwidth as hw
 from halfwidth import fusion
-from halfwidth.methods._affine import design
+from halfwidth.methods._affine_gains import design
 from halfwidth.methods._mixed_rows import mixed_rows
 from halfwidth.methods.mixed import MixedBelief, prior
 

@@ -1,6 +1,6 @@
 """The optimal affine estimator for mixed noise, over a sliding window.
 
-`halfwidth.methods._affine` finds the gains of one window, which depend on no data: they are found once for each
+`halfwidth.methods._affine_gains` finds the gains of one window, which depend on no data: they are found once for each
 pattern of seen outputs, and in a time-invariant model nearly all rows share a few. What is known before the window,
 (m, P, X), is the belief of `MixedFilter`; gains are found for P and X rounded to a grid, and half-widths then
 computed for those gains with the belief itself, so they hold exactly for what is reported.
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from halfwidth.array import Array
 from halfwidth.errors import BadValue, Refused, hinted
-from halfwidth.methods._affine import Window, design, root
+from halfwidth.methods._affine_gains import Window, design, root
 from halfwidth.methods._mixed_rows import MixedRows, Stack, mixed_rows, refuses
 from halfwidth.methods._protocol import typed
 from halfwidth.methods.mixed import MixedBelief, MixedFilter, Pushed, newest_kind, prior
