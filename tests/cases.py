@@ -123,6 +123,7 @@ def _settings():
         "KalmanSmoother": [{"lag": 4}],
         "ExtendedKalman": [{"smooth": True}],
         "UnscentedKalman": [{"smooth": True}],
+        "Hull": [{"memory": 10}, {"memory": 5, "lag": 4}, {"lag": 0}],
         "Constrained": [
             {"by": "truncate", "feedback": True},
             {"by": "project", "method": hw.KalmanSmoother()},

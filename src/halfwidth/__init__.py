@@ -40,6 +40,8 @@ _HOME: dict[str, str] = {
     "forecast": "forecast",
     "ensemble_interval": "methods.window",
     "choose_memory": "methods.window",
+    "bound": "methods.hull",
+    "Bound": "methods.hull",
     "MemoryChoice": "methods.window",
     "learn": "learn",
     "Learned": "learn",
@@ -80,6 +82,9 @@ if TYPE_CHECKING:
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
     from halfwidth.methods.constrain import Constrained as Constrained
+    from halfwidth.methods.hull import Bound as Bound
+    from halfwidth.methods.hull import Hull as Hull
+    from halfwidth.methods.hull import bound as bound
     from halfwidth.methods.kalman import KalmanFilter as KalmanFilter
     from halfwidth.methods.kalman import KalmanSmoother as KalmanSmoother
     from halfwidth.methods.loss import BKF1 as BKF1
@@ -96,6 +101,10 @@ if TYPE_CHECKING:
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
     from halfwidth.methods.sequential import SequentialLP as SequentialLP
+    from halfwidth.methods.sets import ConstrainedZonotopeFilter as ConstrainedZonotopeFilter
+    from halfwidth.methods.sets import EllipsoidFilter as EllipsoidFilter
+    from halfwidth.methods.sets import IntervalFilter as IntervalFilter
+    from halfwidth.methods.sets import ZonotopeFilter as ZonotopeFilter
     from halfwidth.methods.window import MemoryChoice as MemoryChoice
     from halfwidth.methods.window import Window as Window
     from halfwidth.methods.window import choose_memory as choose_memory
