@@ -153,13 +153,13 @@ def main():
     pushes = 2000
     took = _time(lambda: [live.push(y) for y in record.y[:pushes]])
     print(f"  {'stream(model, MixedFilter()).push':50}{1e6 * took / pushes:8.1f}")
-    from halfwidth.methods import mixed_window
+    from halfwidth.methods import _affine_gains
 
     est = None
 
     def window():
         nonlocal est
-        mixed_window._held.clear()
+        _affine_gains._held.clear()
         est = hw.MixedWindow(memory=40).run(model, record)
 
     took = min(_time(window) for _ in range(2))

@@ -9,9 +9,9 @@ from tests.cases import CASES, constant_velocity, oscillator
 
 import halfwidth as hw
 from halfwidth import fusion
+from halfwidth.methods._affine_gains import design
 from halfwidth.methods._mixed_rows import mixed_rows
 from halfwidth.methods.mixed import MixedBelief, prior
-from halfwidth.methods.mixed_window import design
 
 FORMS = ("combined", "ellipsoid", "zonotope")
 LEVEL = 0.9973
