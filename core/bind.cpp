@@ -11,6 +11,8 @@ void bind_nonlinear(nb::module_& m);
 void bind_loss(nb::module_& m);
 void bind_lp(nb::module_& m);
 void bind_chain(nb::module_& m);
+void bind_enclose(nb::module_& m);
+void bind_sets(nb::module_& m);
 void bind_box(nb::module_& m);
 void bind_hull(nb::module_& m);
 void bind_constrain(nb::module_& m);
@@ -29,6 +31,8 @@ NB_MODULE(_core, m) {
     bind_loss(m);
     bind_lp(m);
     bind_chain(m);
+    bind_enclose(m);
+    bind_sets(m);
     bind_box(m);
     bind_hull(m);
     bind_constrain(m);

@@ -5,9 +5,8 @@
 
 #include <cstring>
 #include <memory>
-#include <optional>
-#include <stdexcept>
 
+#include "bind_box.hpp"
 #include "box_entry.hpp"
 
 namespace nb = nanobind;
@@ -15,12 +14,9 @@ using namespace nb::literals;
 
 namespace {
 
-using Array = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
-using Maybe = std::optional<Array>;
-
-void need(bool ok, const char* what) {
-    if (!ok) throw std::invalid_argument(what);
-}
+using Array = hw::BoxArray;
+using Maybe = hw::MaybeArray;
+using hw::need;
 
 nb::object copied(const Array& from, double** data) {
     const std::size_t count = from.size();
@@ -41,17 +37,10 @@ nb::tuple box_contract(Maybe E, Array A, Array C, Array bx_lo, Array bx_hi, Arra
     b.T = static_cast<int>(T);
     b.n = static_cast<int>(n);
     b.m = static_cast<int>(m);
-    auto matrix = [&](const Array& a, const Maybe& hi_end, std::size_t rows, const double*& l, const double*& h, bool& moving) {
-        moving = a.ndim() == 3;
-        need(a.ndim() >= 2 && a.size() == (moving ? T : 1) * rows * n, "matrices (r,n) or (T,r,n) expected");
-        need(!hi_end || hi_end->size() == a.size(), "both ends of a matrix have one shape");
-        l = a.data();
-        h = hi_end ? hi_end->data() : nullptr;
-    };
-    if (E) matrix(*E, E_hi, n, b.E_lo, b.E_hi, b.E_t);
+    if (E) hw::box_matrix(*E, E_hi, T, n, n, b.E_lo, b.E_hi, b.E_t);
     need(E || !E_hi, "both ends of a matrix have one shape");
-    matrix(A, A_hi, n, b.A_lo, b.A_hi, b.A_t);
-    matrix(C, C_hi, m, b.C_lo, b.C_hi, b.C_t);
+    hw::box_matrix(A, A_hi, T, n, n, b.A_lo, b.A_hi, b.A_t);
+    hw::box_matrix(C, C_hi, T, m, n, b.C_lo, b.C_hi, b.C_t);
     b.bx_lo = bx_lo.data();
     b.bx_hi = bx_hi.data();
     b.by_lo = by_lo.data();

@@ -7,10 +7,11 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Bound Box Cloud Constrained DataQualityWarning Estimate
-Estimator ExtendedKalman FearnheadClifford GPB Gaussian Halfspaces HalfwidthError Hull KalmanFilter KalmanSmoother Learned Linear
-LogTooBig Markov MemoryChoice Missing Mixed Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls
-SequentialLP Status Uniform UnscentedKalman Unsolved Window __version__ bound choose_memory ensemble_interval estimate
+BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Bound Box Cloud Constrained
+ConstrainedZonotopeFilter DataQualityWarning EllipsoidFilter Estimate Estimator ExtendedKalman FearnheadClifford GPB
+Gaussian Halfspaces HalfwidthError Hull IntervalFilter KalmanFilter KalmanSmoother Learned Linear LogTooBig Markov
+MemoryChoice Missing Mixed Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls SequentialLP Status
+Uniform UnscentedKalman Unsolved Window ZonotopeFilter __version__ bound choose_memory ensemble_interval estimate
 forecast from_continuous learn resume score simulate stream
 """
 

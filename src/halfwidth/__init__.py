@@ -98,6 +98,10 @@ if TYPE_CHECKING:
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
     from halfwidth.methods.sequential import SequentialLP as SequentialLP
+    from halfwidth.methods.sets import ConstrainedZonotopeFilter as ConstrainedZonotopeFilter
+    from halfwidth.methods.sets import EllipsoidFilter as EllipsoidFilter
+    from halfwidth.methods.sets import IntervalFilter as IntervalFilter
+    from halfwidth.methods.sets import ZonotopeFilter as ZonotopeFilter
     from halfwidth.methods.window import MemoryChoice as MemoryChoice
     from halfwidth.methods.window import Window as Window
     from halfwidth.methods.window import choose_memory as choose_memory

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from halfwidth.array import Array
-from halfwidth.errors import BadValue
+from halfwidth.errors import BadValue, Refused
 from halfwidth.estimate import choose, fits
 from halfwidth.methods._bounds import interval_rows
 from halfwidth.methods._boxes import Boxes
@@ -54,6 +54,8 @@ def bound(model: Linear, record: Record, c: ArrayLike, *, at: int | None = None)
     (2.5, 1.0)
     """
     method = Hull()
+    if not isinstance(model, Linear):
+        raise Refused("`bound` needs a linear model but the model is nonlinear", hint="estimate(model, record, Hull())")
     choose(model, method)
     fits(model, record)
     row = functional_of(c, model.nx)

@@ -139,7 +139,7 @@ def _default(model: Model) -> Any:
     """Return the first recursive method that takes the model."""
     reasons = []
     defaults: tuple[tuple[str, dict[str, Any]], ...] = (
-        ("KalmanFilter", {}), ("Hull", {"memory": 10}), ("UnscentedKalman", {}), ("GPB", {}),
+        ("KalmanFilter", {}), ("Hull", {"memory": 10}), ("ZonotopeFilter", {}), ("UnscentedKalman", {}), ("GPB", {}),
     )  # fmt: skip
     for name, settings in defaults:
         method = methods.load(name)(**settings)
@@ -229,6 +229,9 @@ class _Stepped:
         self.state = self.method.step(model, self.state, row, inputs, self.t + step, step)
         self.t += step
         self.pushed += 1
+        answer = getattr(self.method, "answer", None)
+        if answer is not None:
+            return answer(model, self.state, self.t)  # type: ignore[no-any-return]
         x, P, loglik = self.method.belief(model, self.state)
         newest: Estimate = object.__new__(self.kind)
         verdict = getattr(self.method, "verdict", None)

@@ -8,8 +8,8 @@ import halfwidth as hw
 
 
 def online(method):
-    """Whether a method has an online form; a smoother has one only with a lag, a hull with a memory, `Constrained` what it holds
-    has.
+    """Whether a method has an online form; a smoother has one only with a lag, a hull with a memory, `Constrained`
+    what it holds has.
     """
     if isinstance(method, hw.Constrained):
         return online(method.method) and hasattr(method.method, "step")

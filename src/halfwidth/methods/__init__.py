@@ -21,6 +21,10 @@ ESTIMATORS: dict[str, str] = {
     "SequentialLP": "sequential",
     "Window": "window",
     "Hull": "hull",
+    "IntervalFilter": "sets",
+    "ZonotopeFilter": "sets",
+    "ConstrainedZonotopeFilter": "sets",
+    "EllipsoidFilter": "sets",
     "Constrained": "constrain",
 }
 

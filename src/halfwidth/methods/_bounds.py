@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.errors import Refused
-from halfwidth.model import Linear
+from halfwidth.model import Linear, Model, needs_a_box
 from halfwidth.noise import Uniform
 from halfwidth.record import Record
-from halfwidth.spread import Halfspaces
+from halfwidth.spread import Box, Halfspaces
 from halfwidth.varying import Varying
 
 Pair = tuple[Array, Array]
@@ -148,6 +148,38 @@ class Rows:
         return np.where(low == high, 0.0, np.maximum(up(high - mid), up(mid - low)))
 
 
+def not_bounded(model: Model, name: str, *, walls: bool = False) -> str | None:
+    """Return why a method for known half-widths cannot take a model, with a hint, or None.
+
+    `walls` says whether it takes half-spaces.
+    """
+    if not walls and isinstance(model.bounds, Halfspaces):
+        return needs_a_box(model, name)
+    for symbol, noise in (("w", model.w), ("e", model.e)):
+        if not isinstance(noise, Uniform):
+            kind = type(noise).__name__
+            return (
+                f"`{name}` needs bounded noise but `{symbol}` is `{kind}`, which may be of any size"
+                f"\nhint: {symbol}=Uniform(half-widths)"
+            )
+        if not noise.known:
+            return f"`{name}` needs known half-widths but those of `{symbol}` are unknown\nhint: BatchLP()"
+    if not isinstance(model.x0, Box):
+        return f"`{name}` needs a box as prior but `x0` is `Normal`\nhint: x0=Box(lo, hi), or None for no bounds"
+    if model.loss is not None:
+        return f"`{name}` takes lost outputs as NaN in the record but the model has a hidden loss\nhint: loss=None"
+    if isinstance(model, Linear):
+        ends = model.theta_bounds
+        known = [] if ends is None else (np.isfinite(ends.lo) & np.isfinite(ends.hi)).tolist()
+        for k, entry in enumerate(model.theta_entries):
+            if k >= len(known) or not known[k]:
+                return (
+                    f"`{name}` needs an interval for every unknown entry but `{entry.matrix}[{entry.row}, "
+                    f"{entry.column}]` has none\nhint: theta_bounds=(lo, hi)"
+                )
+    return None
+
+
 def interval_rows(model: Linear, record: Record) -> Rows:
     """Return the rows of a model with known uniform noise over a record."""
     t, dt = record.t, record.steps(model.dt)
@@ -155,6 +187,15 @@ def interval_rows(model: Linear, record: Record) -> Rows:
     pairs = {name: _pair(m, *(m.stack(t, dt)), ends.get(name), len(record)) for name, m in model.matrices.items()}
     u = None if record.u is None else np.asarray(record.u)
     return rows_of(model, pairs, u, np.asarray(record.y), record.seen)
+
+
+def one_row(model: Linear, y: Array, u: Array | None, t: float, dt: float, row: int) -> Rows:
+    """Return the rows of one time: outputs (ny,), inputs (nu,), its number for matrices that are stacked."""
+    ends, pairs = theta_ends(model), {}
+    for name, matrix in model.matrices.items():
+        value = matrix.at(t, dt, row)
+        pairs[name] = ends_of(matrix, value if matrix.constant else value[None], ends.get(name))
+    return rows_of(model, pairs, None if u is None else u[None], y[None], ~np.isnan(y)[None])
 
 
 def rows_of(

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from halfwidth.array import Array
 from halfwidth.errors import BadValue
-from halfwidth.methods._bounds import Rows, ends_of, rows_of, theta_ends
+from halfwidth.methods._bounds import Rows, one_row
 from halfwidth.methods._boxes import Boxes, far_back
 from halfwidth.methods._conflict import conflict_of
 from halfwidth.methods._functional import Bound, functional_of
@@ -27,7 +27,6 @@ class Live:
 
     def __init__(self, hull: Hull, model: Linear, t: float) -> None:
         self.hull, self.model, self.t, self.pushed = hull, model, t, 0
-        self.ends = theta_ends(model)
         self.times: list[float] = []
         self.seen = np.zeros((0, model.ny), dtype=bool)
         lo, hi = outer(model, 1)
@@ -82,13 +81,10 @@ class Live:
 
     def _with(self, y: Array, u: Array | None, t: float, dt: float) -> Rows:
         """Return the rows held and a new one after them."""
-        pairs = {}
         for name, matrix in self.model.matrices.items():
             if matrix.stacked and matrix.value is not None and self.pushed >= len(matrix.value):
                 raise BadValue(f"`{name}` is stacked for {len(matrix.value)} rows, and so many have been pushed")
-            value = matrix.at(t, dt, self.pushed)
-            pairs[name] = ends_of(matrix, value if matrix.constant else value[None], self.ends.get(name))
-        new = rows_of(self.model, pairs, None if u is None else u[None], y[None], ~np.isnan(y)[None])
+        new = one_row(self.model, y, u, t, dt, self.pushed)
         return new if self.rows is None else self.rows.joined(new, self.rows.T)
 
     def _starts(self, seen: NDArray[np.bool_]) -> NDArray[np.int32]:

@@ -9,6 +9,9 @@ is a row left out. Whatever solver runs, what is reported is the dual bound of N
 accounted for (core/hull.hpp): a poor answer loosens it by its own error and cannot put it inside the truth. Data that
 contradict the bounds are a certified `Status.INFEASIBLE` that names rows and times, never a bound.
 
+A nonlinear model is taken where `g` and `h` can be recorded: over boxes that a cheap set found they are affine with a
+proved distance (`halfwidth.enclosure`), which widens the noise; the box is then safe and near the least.
+
 An entry of A, B, C, E or F known only to an interval is NaN with ``theta_bounds``. It may be another number at every
 row; its product with a state is bounded over the state's box, so the answer contains and is no longer the least.
 
@@ -18,6 +21,7 @@ Milanese and Vicino (1991), Automatica 27(6). Neumaier and Shcherbina (2004), Ma
 Benhamou, Goualard, Granvilliers and Puget (1999), ICLP: forward-backward contraction.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -27,12 +31,14 @@ from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.errors import BadValue, Refused
-from halfwidth.methods._bounds import interval_rows
+from halfwidth.methods._affine import affine_rows, not_recorded
+from halfwidth.methods._bounds import Rows, interval_rows, not_bounded
 from halfwidth.methods._boxes import Boxes, Empty, Proposer, stock
 from halfwidth.methods._conflict import Conflict, conflict_of
 from halfwidth.methods._protocol import typed
+from halfwidth.methods.sets import ZonotopeFilter
 from halfwidth.methods.window import window_starts
-from halfwidth.model import Linear, Model
+from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Uniform
 from halfwidth.record import Labels, Record
 from halfwidth.result import Estimate, Status
@@ -47,6 +53,8 @@ FIXES, STRETCH = 2, 10
 REACH, GAIN = 10, 1e-5
 
 PROPOSERS: tuple[Proposer | None, ...] = (None, stock)
+#: Times that a nonlinear model is replaced by affine rows.
+_AFFINE = 2
 
 
 @dataclass(frozen=True)
@@ -98,31 +106,13 @@ class Hull:
 
     def refuses(self, model: Model) -> str | None:
         """Return why nothing can be guaranteed on the model, or None."""
-        if not isinstance(model, Linear):
-            return "`Hull` needs a linear model but the model is nonlinear\nhint: UnscentedKalman()"
-        for name, noise in (("w", model.w), ("e", model.e)):
-            if not isinstance(noise, Uniform):
-                kind = type(noise).__name__
-                return (
-                    f"`Hull` needs bounded noise but `{name}` is `{kind}`, which may be of any size"
-                    f"\nhint: {name}=Uniform(half-widths)"
-                )
-            if not noise.known:
-                return f"`Hull` needs known half-widths but those of `{name}` are unknown\nhint: BatchLP()"
-        if not isinstance(model.x0, Box):
-            return "`Hull` needs a box as prior but `x0` is `Normal`\nhint: x0=Box(lo, hi), or None for no bounds"
-        if model.loss is not None:
-            return "`Hull` takes lost outputs as NaN in the record but the model has a hidden loss\nhint: loss=None"
-        ends = model.theta_bounds
-        known = [] if ends is None else (np.isfinite(ends.lo) & np.isfinite(ends.hi)).tolist()
-        free = [entry for k, entry in enumerate(model.theta_entries) if k >= len(known) or not known[k]]
-        if free:
-            entry = free[0]
+        if isinstance(model, Nonlinear) and self.memory is not None:
             return (
-                "`Hull` needs an interval for every unknown entry but"
-                f" `{entry.matrix}[{entry.row}, {entry.column}]` has none\nhint: theta_bounds=(lo, hi)"
+                f"`{typed(self)}` needs a linear model but the model is nonlinear"
+                "\nhint: Hull() for a whole record, ZonotopeFilter() on line"
             )
-        return None
+        reason = not_bounded(model, "Hull", walls=isinstance(model, Linear))
+        return not_recorded(model, "Hull") if reason is None and isinstance(model, Nonlinear) else reason
 
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
         """Bound the states of one record."""
@@ -144,11 +134,32 @@ class Hull:
         return Live(self, model, t)
 
 
-def run(method: Hull, model: Linear, record: Record, proposers: Sequence[Proposer | None] = PROPOSERS) -> Estimate:
+def run(method: Hull, model: Model, record: Record, proposers: Sequence[Proposer | None] = PROPOSERS) -> Estimate:
     """Bound the states of a record with the given proposers of multipliers, none of which is trusted."""
-    T, nx = len(record), model.nx
-    rows = interval_rows(model, record)
-    lo, hi = outer(model, T)
+    lo, hi = outer(model, len(record))
+    if isinstance(model, Linear):
+        return _bounded(method, model, record, interval_rows(model, record), lo, hi, proposers)
+    # Affine rows over the boxes of a cheap set, and once more over those that they give.
+    est = ZonotopeFilter().run(model, record)
+    for _ in range(_AFFINE):
+        if not est.status.good:
+            return dataclasses.replace(est, method=typed(method))
+        lo[1:], hi[1:] = est.interval()
+        est = _bounded(method, model, record, affine_rows(model, record, lo, hi), lo, hi, proposers)
+    return est
+
+
+def _bounded(
+    method: Hull,
+    model: Model,
+    record: Record,
+    rows: Rows,
+    lo: Array,
+    hi: Array,
+    proposers: Sequence[Proposer | None],
+) -> Estimate:
+    """Bound the states by rows, from boxes (T + 1, nx) that are safe already."""
+    nx = model.nx
     boxes = Boxes(rows, lo.copy(), hi.copy(), proposers)
     out_lo, out_hi, empty = narrowed(method, boxes, record.seen)
     info: dict[str, Any] = {"loose": boxes.loose, "sides": boxes.asked, "x0_lo": boxes.lo[0], "x0_hi": boxes.hi[0]}
@@ -168,7 +179,7 @@ def run(method: Hull, model: Linear, record: Record, proposers: Sequence[Propose
 
 def answer(
     method: Hull,
-    model: Linear,
+    model: Model,
     t: Array,
     x: Array,
     box: Box | None,
@@ -183,7 +194,7 @@ def answer(
     return Estimate(t, x, box, status, typed(method), q=q, r=r, names=model.names.x, labels=labels, info=info)
 
 
-def outer(model: Linear, T: int) -> tuple[Array, Array]:
+def outer(model: Model, T: int) -> tuple[Array, Array]:
     """Return what is known of the states x_0 .. x_T without any row, each (T + 1, nx)."""
     assert isinstance(model.x0, Box)
     lo, hi = np.full((T + 1, model.nx), -np.inf), np.full((T + 1, model.nx), np.inf)
