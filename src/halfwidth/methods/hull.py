@@ -116,7 +116,6 @@ class Hull:
 
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
         """Bound the states of one record."""
-        assert isinstance(model, Linear)
         return run(self, model, record)
 
     def stream(self, model: Linear, t: float) -> "Live":
