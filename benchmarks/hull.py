@@ -27,7 +27,7 @@ NAN = np.nan
 EVERY = 30.0  # s between two lines of progress
 
 
-def paper003(rng):
+def paper003(_):
     """The three-state system of paper 003 with half of its noise."""
     A = np.array([[0.4, -0.3, 0.1], [-0.4, 0.4, 0.0], [0.3, 0.2, 0.2]])
     B = np.array([[1.0], [0.5], [-0.3]])
@@ -35,7 +35,7 @@ def paper003(rng):
     return hw.Linear(A, B, C, hw.Uniform(0.1), hw.Uniform(0.3), hw.Box(-np.ones(3), np.ones(3))), 3
 
 
-def vehicle(rng):
+def vehicle(_):
     """Position and speed on two axes."""
     car = hw.vehicle.constant_velocity(dt=0.1, q=[0.02, 0.02, 0.05, 0.05], r=[0.5, 0.5])
     box = hw.Box(-np.array([5.0, 5, 8, 8]), np.array([5.0, 5, 8, 8]))
@@ -54,7 +54,9 @@ def drawn(rng):
     size = 10.0 ** rng.uniform(-2, 2)
     x0 = hw.Box(-size * np.ones(n), size * np.ones(n)) if rng.random() < 0.8 else None
     r = 10.0 ** rng.uniform(-3, 0.5, m)
-    return hw.Linear(A, rng.standard_normal((n, 1)), rng.standard_normal((m, n)), hw.Uniform(q), hw.Uniform(r), x0, E=E, F=F), n
+    return hw.Linear(
+        A, rng.standard_normal((n, 1)), rng.standard_normal((m, n)), hw.Uniform(q), hw.Uniform(r), x0, E=E, F=F
+    ), n
 
 
 def corners(rng, T, half):

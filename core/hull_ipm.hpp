@@ -91,7 +91,7 @@ struct HullIpm {
             const double* Er = unit ? nullptr : r.E + (r.E_t ? t * nn : 0);
             const double *Ar = r.A + (r.A_t ? t * nn : 0), *Cr = r.C + (r.C_t ? t * mn : 0);
             for (int i = 0; i < kinds; i++) {
-                const double lo = r.r_lo[I(t) * kinds + i], hi = r.r_hi[I(t) * kinds + i];
+                double lo = r.r_lo[I(t) * kinds + i], hi = r.r_hi[I(t) * kinds + i];
                 const I at = I(t + 1) * G + n + i;
                 double* own = i < n ? E + t * nn + i * n : C + t * mn + (i - n) * n;
                 double* bef = A + t * nn + i * n;
@@ -104,7 +104,7 @@ struct HullIpm {
                         reach += magnitude(bef[j]);
                     }
                 }
-                live[at] = finite(lo) && finite(hi) && reach > 0.0;
+                live[at] = (finite(lo) || finite(hi)) && reach > 0.0 && finite(reach);
                 if (!live[at]) {
                     scale[at] = 1.0;
                     b[at] = 0.0;
@@ -114,6 +114,8 @@ struct HullIpm {
                     }
                     continue;
                 }
+                if (!finite(lo)) lo = min2(-1.01 * reach, 1.01 * hi);  // a side without end ends where the boxes do
+                if (!finite(hi)) hi = max2(1.01 * reach, 1.01 * lo);
                 const double half = 0.5 * hi - 0.5 * lo;
                 stiff[at] = !(half > hull_narrow * reach);
                 const double h = stiff[at] ? reach : half, ih = 1.0 / h;

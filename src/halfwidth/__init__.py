@@ -39,8 +39,8 @@ _HOME: dict[str, str] = {
     "resume": "stream",
     "forecast": "forecast",
     "ensemble_interval": "methods.window",
-    "bound": "methods.hull",
-    "Bound": "methods.hull",
+    "bound": "bound",
+    "Bound": "methods._functional",
     "choose_memory": "methods.memory",
     "MemoryChoice": "methods.memory",
     "learn": "learn",
@@ -62,6 +62,7 @@ _HOME: dict[str, str] = {
 __all__ = ["__version__", *sorted(_HOME)]
 
 if TYPE_CHECKING:
+    from halfwidth.bound import bound as bound
     from halfwidth.continuous import from_continuous as from_continuous
     from halfwidth.errors import BadLog as BadLog
     from halfwidth.errors import BadRecord as BadRecord
@@ -79,12 +80,11 @@ if TYPE_CHECKING:
     from halfwidth.learn import learn as learn
     from halfwidth.loss import Bernoulli as Bernoulli
     from halfwidth.loss import Markov as Markov
+    from halfwidth.methods._functional import Bound as Bound
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
     from halfwidth.methods.constrain import Constrained as Constrained
-    from halfwidth.methods.hull import Bound as Bound
     from halfwidth.methods.hull import Hull as Hull
-    from halfwidth.methods.hull import bound as bound
     from halfwidth.methods.kalman import KalmanFilter as KalmanFilter
     from halfwidth.methods.kalman import KalmanSmoother as KalmanSmoother
     from halfwidth.methods.loss import BKF1 as BKF1

@@ -10,7 +10,7 @@ from halfwidth import _core
 
 
 def window(rng, K, n, m, *, interval=0.0, stacked=False):
-    (E, A, C, bx, by, lo, hi), x = chain(rng, K, n, m, interval=interval, stacked=stacked)
+    (E, A, C, bx, by, *_), x = chain(rng, K, n, m, interval=interval, stacked=stacked)
     reach = np.abs(x).max(axis=1, keepdims=True) * rng.uniform(0.1, 2.0)
     return (E, A, C, bx, by, x - reach, x + reach), x
 
@@ -128,7 +128,7 @@ def test_the_solver_is_tight(n):
     for stacked in (False, True):
         parts, x = window(rng, 12, n, 2, stacked=stacked)
         c = np.vstack((np.eye(n), -np.eye(n)))
-        bound, _, value, gap, lo, hi, iterations, bad = asked(parts, c, [7] * (2 * n))
+        bound, _, value, _, lo, hi, iterations, bad = asked(parts, c, [7] * (2 * n))
         assert bad == 0
         assert iterations <= 60
         width = (hi - lo)[7]

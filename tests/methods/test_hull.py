@@ -81,8 +81,10 @@ def test_filtered_is_as_tight_as_its_window_promises(method, ratio):
 
 
 def test_a_lag_lies_between_filter_and_smoother():
-    model, truth, record = plant()
-    width = [np.subtract(*hw.estimate(model, record, m).interval()[::-1]) for m in (hw.Hull(10), hw.Hull(10, 5), hw.Hull())]
+    model, _, record = plant()
+    width = [
+        np.subtract(*hw.estimate(model, record, m).interval()[::-1]) for m in (hw.Hull(10), hw.Hull(10, 5), hw.Hull())
+    ]
     assert np.all(width[1] <= width[0] * (1 + 1e-6))
     assert np.all(width[2] <= width[1] * (1 + 1e-6))
     low, high = exact(dataclasses.replace(model, F=None), plant(F=False)[2], 12, 17)
@@ -111,7 +113,7 @@ def test_no_violation_in_a_hundred_thousand_state_steps():
 def honest(ask):
     from halfwidth.methods._boxes import bounded
 
-    bound, y, value, *_ = bounded(ask, None, contract=False)
+    _, y, value, *_ = bounded(ask, None, contract=False)
     return y, value
 
 
@@ -230,7 +232,15 @@ def test_a_prior_without_ends_is_found_from_the_data(method):
     """Nothing bounds the speed alone: two positions do, and a mixing C keeps contraction from seeing either."""
     mix = np.array([[1.0, 0.7], [0.4, -1.0]])
     for C in (np.eye(1, 2), mix):
-        model = hw.Linear([[1, 0.5], [0, 1]], None, C, hw.Uniform(0.05), hw.Uniform(0.2), hw.Box(-3 * np.ones(2), 3 * np.ones(2)), dt=0.5)
+        model = hw.Linear(
+            [[1, 0.5], [0, 1]],
+            None,
+            C,
+            hw.Uniform(0.05),
+            hw.Uniform(0.2),
+            hw.Box(-3 * np.ones(2), 3 * np.ones(2)),
+            dt=0.5,
+        )
         truth, record = hw.simulate(model, T=30, seed=1)
         record = holes(record, 1, 0.2)
         free = dataclasses.replace(model, x0=hw.Box(-np.inf * np.ones(2), np.inf * np.ones(2)))
@@ -314,7 +324,7 @@ def test_matrices_and_steps_that_vary():
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-6, 1.0, 1e6, 1e12])
 def test_scales(scale):
-    model, truth, record = plant(T=25)
+    model, _, record = plant(T=25)
     s = hw.Uniform
     scaled = dataclasses.replace(
         model, B=scale * model.B.single, w=s(scale * model.w.q), e=s(scale * model.e.q),
@@ -339,7 +349,9 @@ def test_states_of_very_different_size_far_from_zero():
 
 def test_states_without_noise_are_found_exactly():
     """A constant unknown speed: the hull is a polygon in (position, speed) that all rows cut."""
-    model = hw.Linear([[1.0, 1.0], [0.0, 1.0]], None, [[1.0, 0.0]], hw.Uniform(0.0), hw.Uniform(0.5), hw.Box([-1, -1], [1, 1]))
+    model = hw.Linear(
+        [[1.0, 1.0], [0.0, 1.0]], None, [[1.0, 0.0]], hw.Uniform(0.0), hw.Uniform(0.5), hw.Box([-1, -1], [1, 1])
+    )
     truth, record = hw.simulate(model, T=30, seed=3)
     # the simulated truth obeys w = 0 up to its rounding only
     model = dataclasses.replace(model, w=hw.Uniform(1e-13))
@@ -352,7 +364,7 @@ def test_states_without_noise_are_found_exactly():
 
 
 def test_a_forecast_only_grows():
-    model, truth, record = plant()
+    model, _, record = plant()
     ahead = hw.forecast(model, record, 12, u=np.zeros((12, 1)), method=hw.Hull())
     lo, hi = ahead.interval()
     assert ahead.guaranteed
@@ -381,12 +393,12 @@ def test_a_functional_is_bounded_as_its_own_program_says():
 
 
 def test_excess_says_that_a_fix_cannot_be_and_by_how_much():
-    inside = family.Bound(-1.0, 2.0)
+    inside = hw.Bound(-1.0, 2.0)
     assert inside.excess(2.5, 0.5) == 0.0
     assert inside.excess(3.0, 0.5) == pytest.approx(0.5)
     assert inside.excess(-2.0, 0.25) == pytest.approx(0.75)
     assert inside.excess(1.0) == 0.0
-    many = family.Bound(np.array([0.0, 0.0]), np.array([1.0, 1.0]))
+    many = hw.Bound(np.array([0.0, 0.0]), np.array([1.0, 1.0]))
     np.testing.assert_allclose(many.excess([0.5, 2.0], 0.5), [0.0, 0.5])
 
 
@@ -465,3 +477,51 @@ def test_it_is_the_default_for_known_half_widths():
     model, _, record = plant()
     assert hw.estimate(model, record).method == "Hull()"
     assert hw.stream(model).push(record.y[0], record.u[0]).guaranteed
+
+
+def test_half_spaces_are_rows_like_others():
+    """Two cars on one road: the first stays ahead by one at least, which only the difference knows."""
+    gap = hw.Halfspaces([[1.0, -1.0]], 1.0)
+    model = hw.Linear(np.eye(2), None, np.eye(2), hw.Uniform(0.2), hw.Uniform(0.5), hw.Box([0, 0], [4, 4]), bounds=gap)
+    y = np.array([[2.0, 1.2], [2.1, np.nan], [1.9, np.nan], [np.nan, 0.9]])
+    est = hw.estimate(model, hw.Record(np.arange(4.0), y), hw.Hull()).check()
+    lo, hi = est.interval()
+    free = hw.estimate(dataclasses.replace(model, bounds=None), hw.Record(np.arange(4.0), y), hw.Hull())
+    a, b = free.interval()
+    assert np.all(lo >= a - 1e-9)
+    assert np.all(hi <= b + 1e-9)
+    assert np.mean(hi - lo) < 0.95 * np.mean(b - a)
+    c = linprog_of_half_spaces(y)
+    np.testing.assert_allclose((lo[1], hi[1]), c, atol=1e-6)
+    y[2, 0], y[3, 1] = -1.0, 3.0
+    bad = hw.estimate(model, hw.Record(np.arange(4.0), y), hw.Hull())
+    assert bad.status is hw.Status.INFEASIBLE
+    assert bad.info["proved"]
+
+
+def linprog_of_half_spaces(y):
+    """Return the hull of the second state by one dense program a side."""
+    rows, high = [], []
+    for t in range(4):
+        for j in range(2):
+            e = np.zeros(10)
+            e[2 * (t + 1) + j], e[2 * t + j] = 1, -1
+            rows += [e, -e]
+            high += [0.2, 0.2]
+            if np.isfinite(y[t, j]):
+                e = np.zeros(10)
+                e[2 * (t + 1) + j] = 1
+                rows += [e, -e]
+                high += [y[t, j] + 0.5, 0.5 - y[t, j]]
+        e = np.zeros(10)
+        e[2 * (t + 1)], e[2 * (t + 1) + 1] = -1, 1
+        rows.append(e)
+        high.append(-1.0)
+    box = [(0, 4)] * 2 + [(None, None)] * 8
+    ends = []
+    for sign in (1, -1):
+        for j in range(2):
+            c = np.zeros(10)
+            c[4 + j] = sign
+            ends.append(sign * linprog(c, np.array(rows), high, bounds=box, method="highs").fun)
+    return np.array(ends[:2]), np.array(ends[2:])

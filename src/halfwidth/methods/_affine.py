@@ -81,7 +81,7 @@ def motion(model: Nonlinear, u: Array | None, dt: float, lo: Array, hi: Array) -
     free = np.full((1, model.ny), np.inf)
     rows = Rows(g.J, np.zeros((model.ny, model.nx)), down(g.k - half)[None], up(g.k + half)[None], -free, free)
     inside = down(g.lo - model.w.q), up(g.hi + model.w.q)
-    if model.bounds is not None:
+    if isinstance(model.bounds, Box):
         inside = np.maximum(inside[0], model.bounds.lo), np.minimum(inside[1], model.bounds.hi)
     return rows, inside
 
@@ -112,8 +112,10 @@ def affine_rows(model: Nonlinear, record: Record, lo: Array, hi: Array) -> Rows:
         row, _ = motion(model, u, float(dt), lo[k], hi[k])
         every.append(outputs(model, row, record.y[k], lo[k + 1], hi[k + 1]))
     A, C = np.array([row.A_lo for row in every]), np.array([row.C_lo for row in every])
-    sides = [np.concatenate([getattr(row, s) for row in every]) for s in ("bx_lo", "bx_hi", "by_lo", "by_hi")]
-    return Rows(A, C, *sides)
+    bx_lo, bx_hi, by_lo, by_hi = (
+        np.concatenate([getattr(row, s) for row in every]) for s in ("bx_lo", "bx_hi", "by_lo", "by_hi")
+    )
+    return Rows(A, C, bx_lo, bx_hi, by_lo, by_hi)
 
 
 def _turned(model: Nonlinear, y: Array, lo: Array, hi: Array) -> tuple[Array, Array]:

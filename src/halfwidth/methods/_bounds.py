@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.errors import Refused
-from halfwidth.model import Linear, Model
+from halfwidth.model import Linear, Model, needs_a_box
 from halfwidth.noise import Uniform
 from halfwidth.record import Record
-from halfwidth.spread import Box
+from halfwidth.spread import Box, Halfspaces
 from halfwidth.varying import Varying
 
 Pair = tuple[Array, Array]
@@ -27,12 +27,12 @@ Pair = tuple[Array, Array]
 
 def down(value: Any) -> Array:
     """Return a number below each rounded result, and so not above the exact one."""
-    return np.nextafter(value, -np.inf)
+    return np.asarray(np.nextafter(value, -np.inf))
 
 
 def up(value: Any) -> Array:
     """Return a number above each rounded result, and so not below the exact one."""
-    return np.nextafter(value, np.inf)
+    return np.asarray(np.nextafter(value, np.inf))
 
 
 def below(a: Any, b: Any) -> Array:
@@ -61,6 +61,8 @@ class Rows:
     E_lo : as A_lo, or None for the identity
     E_hi, A_hi, C_hi : as E_lo, A_lo, C_lo, or None
         Upper ends where entries are intervals.
+    walls : int
+        How many of the last rows of C are bounds of the state, which no noise widens.
     """
 
     A_lo: Array
@@ -73,6 +75,7 @@ class Rows:
     E_hi: Array | None = None
     A_hi: Array | None = None
     C_hi: Array | None = None
+    walls: int = 0
 
     @property
     def T(self) -> int:
@@ -82,12 +85,12 @@ class Rows:
     @property
     def nx(self) -> int:
         """Number of states."""
-        return self.bx_lo.shape[1]
+        return int(self.bx_lo.shape[1])
 
     @property
     def ny(self) -> int:
-        """Number of outputs."""
-        return self.by_lo.shape[1]
+        """Number of outputs, and of half-spaces after them."""
+        return int(self.by_lo.shape[1])
 
     def part(self, a: int, b: int) -> "Rows":
         """Return rows a to b - 1."""
@@ -97,7 +100,7 @@ class Rows:
 
         return Rows(
             cut(self.A_lo), cut(self.C_lo), self.bx_lo[a:b], self.bx_hi[a:b], self.by_lo[a:b], self.by_hi[a:b],
-            cut(self.E_lo), cut(self.E_hi), cut(self.A_hi), cut(self.C_hi),
+            cut(self.E_lo), cut(self.E_hi), cut(self.A_hi), cut(self.C_hi), self.walls,
         )  # fmt: skip
 
     def without_dynamics(self, row: int) -> "Rows":
@@ -124,10 +127,10 @@ class Rows:
             return both(l0, l1), both(l0 if h0 is None else h0, l1 if h1 is None else h1)
 
         (E_lo, E_hi), (A_lo, A_hi), (C_lo, C_hi) = (pair(f"{k}_lo", f"{k}_hi") for k in "EAC")
-        sides = [
+        bx_lo, bx_hi, by_lo, by_hi = (
             np.concatenate((getattr(self, k)[a:], getattr(other, k))) for k in ("bx_lo", "bx_hi", "by_lo", "by_hi")
-        ]
-        return Rows(A_lo, C_lo, *sides, E_lo, E_hi, A_hi, C_hi)
+        )
+        return Rows(A_lo, C_lo, bx_lo, bx_hi, by_lo, by_hi, E_lo, E_hi, A_hi, C_hi, self.walls)
 
     def middle(self, name: str) -> Array:
         """Return E, A or C (T, ., .) with the middle of each interval."""
@@ -145,8 +148,13 @@ class Rows:
         return np.where(low == high, 0.0, np.maximum(up(high - mid), up(mid - low)))
 
 
-def not_bounded(model: Model, name: str) -> str | None:
-    """Return why a method for known half-widths cannot take a model, with a hint, or None."""
+def not_bounded(model: Model, name: str, *, walls: bool = False) -> str | None:
+    """Return why a method for known half-widths cannot take a model, with a hint, or None.
+
+    `walls` says whether it takes half-spaces.
+    """
+    if not walls and isinstance(model.bounds, Halfspaces):
+        return needs_a_box(model, name)
     for symbol, noise in (("w", model.w), ("e", model.e)):
         if not isinstance(noise, Uniform):
             kind = type(noise).__name__
@@ -204,12 +212,22 @@ def rows_of(
     C_lo, C_hi = pairs["C"]
     if "F" not in pairs:
         known = np.where(seen, y, 0.0)
-        by = np.where(seen, below(known, -r), -np.inf), np.where(seen, above(known, r), np.inf)
+        by: tuple[Array, ...] = (np.where(seen, below(known, -r), -np.inf), np.where(seen, above(known, r), np.inf))
     else:
         C_lo, C_hi, by = _folded(pairs["F"], (C_lo, C_hi), y, seen, r)
     E = pairs.get("E", (None, None))
-    A = pairs["A"]
-    return Rows(A[0], C_lo, *bx, *by, E[0], E[1], A[1], C_hi)
+    A, walls = pairs["A"], 0
+    if isinstance(model.bounds, Halfspaces):
+        D, low, high = model.bounds.rows
+        walls = len(D)
+        C_lo, C_hi = _stacked(C_lo, D), None if C_hi is None else _stacked(C_hi, D)
+        by = tuple(np.hstack((end, np.tile(wall, (T, 1)))) for end, wall in zip(by, (low, high), strict=True))
+    return Rows(A[0], C_lo, *bx, by[0], by[1], E[0], E[1], A[1], C_hi, walls)
+
+
+def _stacked(C: Array, D: Array) -> Array:
+    """Return C with the rows of D below, at every row of the record where C varies."""
+    return np.ascontiguousarray(np.concatenate((C, np.broadcast_to(D, (*C.shape[:-2], *D.shape))), axis=-2))
 
 
 def theta_ends(model: Linear) -> dict[str, Pair]:

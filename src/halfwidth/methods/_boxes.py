@@ -2,7 +2,7 @@
 
 A window is a stretch of rows between boxes that are safe already. `Boxes.narrow` contracts them (core/box.hpp), bounds
 both sides of every wanted entry by a linear program (core/hull.hpp) and keeps whatever is tighter. The multipliers come
-from a solver that is not trusted: the bound they give is proved for any multipliers, so a wrong answer costs width only.
+from a solver that is not trusted: the bound is proved for any multipliers, so a wrong answer costs width only.
 Where the bound and the solver's own objective disagree, the window is asked again from the narrower boxes, and in the
 end of the stock solver.
 """
@@ -88,8 +88,8 @@ class Boxes:
             if self.proposers[0] is None:
                 before = done
                 done = _core.hull_sweep(
-                    r.E_lo, r.A_lo, r.C_lo, r.bx_lo, r.bx_hi, r.by_lo, r.by_hi, self.lo, self.hi, a, b, k, out_lo, out_hi,
-                    done, LOOSE, _LEAST, E_hi=r.E_hi, A_hi=r.A_hi, C_hi=r.C_hi,
+                    r.E_lo, r.A_lo, r.C_lo, r.bx_lo, r.bx_hi, r.by_lo, r.by_hi, self.lo, self.hi, a, b, k, out_lo,
+                    out_hi, done, LOOSE, _LEAST, E_hi=r.E_hi, A_hi=r.A_hi, C_hi=r.C_hi,
                 )  # fmt: skip
                 self.asked += 2 * r.nx * (done - before)
             if done < len(todo):  # this one is not clean
@@ -181,7 +181,9 @@ class Boxes:
         k = np.full(2, state - a, dtype=np.int32)
         best = np.full(2, np.inf)
         for proposer in self.proposers:
-            bound, _, value, _, _, bad = bounded(Question(part, lo, hi, np.vstack((c, -c)), k), proposer, contract=False)
+            bound, _, value, _, _, bad = bounded(
+                Question(part, lo, hi, np.vstack((c, -c)), k), proposer, contract=False
+            )
             best = best if bad else np.minimum(best, bound)
             if np.all(best - value <= LOOSE * max(float(best.sum()), 0.0) + 1e-13 * np.abs(best)):
                 break
@@ -261,7 +263,7 @@ def sides(nx: int, state: int) -> tuple[Array, NDArray[np.int32]]:
 def bounded(
     ask: Question, proposer: Proposer | None, *, contract: bool
 ) -> tuple[Array, Array, Array, Array, Array, int]:
-    """Return proved bounds (functionals,), the multipliers, the proposed objectives, the boxes, and 1 + the row at fault."""
+    """Return proved bounds (functionals,), multipliers, proposed objectives, the boxes, and 1 + the row at fault."""
     r = ask.rows
     given = [r.E_lo, r.A_lo, r.C_lo, r.bx_lo, r.bx_hi, r.by_lo, r.by_hi]
     last = {"E_hi": r.E_hi, "A_hi": r.A_hi, "C_hi": r.C_hi}
@@ -278,9 +280,7 @@ def bounded(
         value = np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), (len(ask.c),)))
     except (TypeError, ValueError):
         y, value = np.zeros(shape), np.full(len(ask.c), -np.inf)
-    bound, y, _, _, lo, hi, _, bad = _core.hull_window(
-        *given, ask.lo, ask.hi, ask.c, ask.k, y=y, sweeps=sweeps, **last
-    )
+    bound, y, _, _, lo, hi, _, bad = _core.hull_window(*given, ask.lo, ask.hi, ask.c, ask.k, y=y, sweeps=sweeps, **last)
     return bound, y, value, lo, hi, int(bad)
 
 
@@ -291,7 +291,7 @@ def stock(ask: Question) -> tuple[Array, Array]:
     M, low, high = sparse_rows(ask.rows)
     nx = ask.rows.nx
     y, value = np.zeros((len(ask.c), ask.rows.T, nx + ask.rows.ny)), np.full(len(ask.c), -np.inf)
-    seen = np.isfinite(low) & np.isfinite(high)
+    seen = np.isfinite(low) | np.isfinite(high)
     if not seen.any():
         return y, value
     for p, (c, k) in enumerate(zip(ask.c, ask.k, strict=True)):

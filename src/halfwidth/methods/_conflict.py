@@ -113,18 +113,21 @@ def _least_growth(rows: Rows, lo: Array, hi: Array) -> tuple[float, Array, Array
     from halfwidth.solvers.lp import HIGHS, Program, solve
 
     M, low, high = sparse_rows(rows)
-    seen: NDArray[np.bool_] = np.isfinite(low) & np.isfinite(high)
-    M, mid, half = M[seen], 0.5 * (low[seen] + high[seen]), 0.5 * (high[seen] - low[seen])
+    noise = np.tile(np.arange(rows.nx + rows.ny) < rows.nx + rows.ny - rows.walls, rows.T)
+    seen: NDArray[np.bool_] = np.isfinite(low) | np.isfinite(high)
+    M, low, high, noise = M[seen], low[seen], high[seen], noise[seen]
+    with np.errstate(invalid="ignore"):
+        mid = 0.5 * (low + high)
+        half = np.where(noise, 0.5 * (high - low), 0.0)
     column = sp.csr_array(half[:, None])
-    none = np.full(len(mid), np.inf)
-    size = M.shape[1]
-    cost = np.zeros(size + 1)
+    none = np.full(len(low), np.inf)
+    cost = np.zeros(M.shape[1] + 1)
     cost[-1] = 1.0
     program = Program(
         cost,
         sp.csr_array(sp.vstack((sp.hstack((M, -column)), sp.hstack((M, column))))),
-        np.r_[-none, mid],
-        np.r_[mid, none],
+        np.r_[-none, np.where(noise, mid, low)],
+        np.r_[np.where(noise, mid, high), none],
         np.r_[lo.ravel(), 0.0],
         np.r_[hi.ravel(), np.inf],
     )
@@ -132,7 +135,7 @@ def _least_growth(rows: Rows, lo: Array, hi: Array) -> tuple[float, Array, Array
     if not answer.solved or answer.x is None or answer.z is None or not answer.x[-1] < _ABSURD:
         return None
     y = np.zeros(rows.T * (rows.nx + rows.ny))
-    y[seen] = -(answer.z[: len(mid)] + answer.z[len(mid) :])
+    y[seen] = -(answer.z[: len(low)] + answer.z[len(low) :])
     return float(answer.x[-1]), y.reshape(rows.T, -1), answer.x[:-1].reshape(-1, rows.nx)[1:]
 
 
@@ -149,7 +152,9 @@ def _refuted(rows: Rows, lo: Array, hi: Array, y: Array) -> bool:
 
 def _named(rows: Rows, y: Array, t: Array, names: tuple[tuple[str, ...], tuple[str, ...]]) -> tuple[Culprit, ...]:
     """Return the rows with a share in the ray, weighed by their half-widths where they have one."""
-    low, high = (np.concatenate((getattr(rows, f"bx_{end}"), getattr(rows, f"by_{end}")), axis=1) for end in ("lo", "hi"))
+    low, high = (
+        np.concatenate((getattr(rows, f"bx_{end}"), getattr(rows, f"by_{end}")), axis=1) for end in ("lo", "hi")
+    )
     there = np.isfinite(low) & np.isfinite(high)
     half = 0.5 * (np.where(there, high, 0.0) - np.where(there, low, 0.0))
     weight = np.abs(y) * half
@@ -160,18 +165,18 @@ def _named(rows: Rows, y: Array, t: Array, names: tuple[tuple[str, ...], tuple[s
         return ()
     share = weight / total
     return tuple(
-        Culprit(float(t[k]), *_kind(int(j), rows.nx, names), float(share[k, j]))
-        for k, j in np.argwhere(share > _SHARE)
+        Culprit(float(t[k]), *_kind(int(j), rows.nx, names), float(share[k, j])) for k, j in np.argwhere(share > _SHARE)
     )
 
 
 def _kind(j: int, nx: int, names: tuple[tuple[str, ...], tuple[str, ...]]) -> tuple[str, str]:
-    return ("motion of", names[0][j]) if j < nx else ("output", names[1][j - nx])
+    if j < nx:
+        return "motion of", names[0][j]
+    ny = len(names[1])
+    return ("output", names[1][j - nx]) if j < nx + ny else ("bound", f"row {j - nx - ny} of D")
 
 
 def _rounded_up(value: float) -> float:
     """Return a number of four digits not below `value`."""
     unit = 10.0 ** (np.floor(np.log10(value)) - 3)
     return float(np.ceil(value / unit) * unit)
-
-

@@ -5,12 +5,12 @@ With known half-widths the data leave a polytope of trajectories,
     |E x[t] - A x[t-1] - B u[t]| <= q,     |F y[t] - C x[t]| <= r   (seen rows),     x0 in its box,
 
 and the hull is the least box around the states x[t] of it. Each of its 2 nx sides is a linear program; a missing output
-is a row left out. Whatever solver runs, what is reported is the dual bound of Neumaier and Shcherbina with every rounding
+is a row left out. Whatever solver runs, what is reported is the dual bound of Neumaier and Shcherbina with all rounding
 accounted for (core/hull.hpp): a poor answer loosens it by its own error and cannot put it inside the truth. Data that
 contradict the bounds are a certified `Status.INFEASIBLE` that names rows and times, never a bound.
 
-A nonlinear model is taken where `g` and `h` can be recorded: over boxes that a cheap set found they are affine functions
-with a proved distance (`halfwidth.enclosure`), which widens the noise; the box is then safe and near the least.
+A nonlinear model is taken where `g` and `h` can be recorded: over boxes that a cheap set found they are affine with a
+proved distance (`halfwidth.enclosure`), which widens the noise; the box is then safe and near the least.
 
 An entry of A, B, C, E or F known only to an interval is NaN with ``theta_bounds``. It may be another number at every
 row; its product with a state is bounded over the state's box, so the answer contains and is no longer the least.
@@ -22,37 +22,39 @@ Benhamou, Goualard, Granvilliers and Puget (1999), ICLP: forward-backward contra
 """
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from halfwidth.array import Array, of_size, real
-from halfwidth.errors import BadShape, BadValue, Refused
+from halfwidth.array import Array
+from halfwidth.errors import BadValue, Refused
 from halfwidth.methods._affine import affine_rows, not_recorded
-from halfwidth.methods._bounds import Rows, ends_of, interval_rows, not_bounded, rows_of, theta_ends
-from halfwidth.methods._boxes import Boxes, Empty, Proposer, far_back, stock
+from halfwidth.methods._bounds import Rows, interval_rows, not_bounded
+from halfwidth.methods._boxes import Boxes, Empty, Proposer, stock
 from halfwidth.methods._conflict import Conflict, conflict_of
-from halfwidth.methods._protocol import pushed_row, typed
+from halfwidth.methods._protocol import typed
 from halfwidth.methods.sets import ZonotopeFilter
 from halfwidth.methods.window import window_starts
 from halfwidth.model import Linear, Model, Nonlinear
-from halfwidth.record import Record
+from halfwidth.noise import Uniform
+from halfwidth.record import Labels, Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box
 
-#: A window reaches back until it holds this many seen entries of every output, but at most so many memories.
-_FIXES, _STRETCH = 2, 10
-#: Without a memory, the first reach of a window; it doubles until a state gains less than _GAIN of its width.
-_REACH, _GAIN = 10, 1e-5
+if TYPE_CHECKING:
+    from halfwidth.methods._hull_live import Live
 
+#: A window reaches back until it holds this many seen entries of every output, but at most so many memories.
+FIXES, STRETCH = 2, 10
+#: Without a memory, the first reach of a window; it doubles until a state gains less than GAIN of its width.
+REACH, GAIN = 10, 1e-5
+
+PROPOSERS: tuple[Proposer | None, ...] = (None, stock)
 #: Times that a nonlinear model is replaced by affine rows.
 _AFFINE = 2
-
-_PROPOSERS: tuple[Proposer | None, ...] = (None, stock)
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class Hull:
     -----
     ``x`` is the middle of the box. In ``info``: ``x0_lo``, ``x0_hi`` (nx,), the box of the state one step before the
     first row; ``loose``, how many sides are wider than 1e-6 of the width above the least (status REDUCED), of how many
-    ``sides``; of an infeasible record ``conflict`` and its ``growth``, the factor on all half-widths that reconciles it.
+    ``sides``; of an infeasible record ``conflict``, its rows, and ``growth``, the factor on all half-widths that
+    reconciles it.
 
     Raises
     ------
@@ -108,14 +111,14 @@ class Hull:
                 f"`{typed(self)}` needs a linear model but the model is nonlinear"
                 "\nhint: Hull() for a whole record, ZonotopeFilter() on line"
             )
-        reason = not_bounded(model, "Hull")
+        reason = not_bounded(model, "Hull", walls=isinstance(model, Linear))
         return not_recorded(model, "Hull") if reason is None and isinstance(model, Nonlinear) else reason
 
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
         """Bound the states of one record."""
         return run(self, model, record)
 
-    def stream(self, model: Linear, t: float) -> "_Live":
+    def stream(self, model: Linear, t: float) -> "Live":
         """Return the on-line form, for `halfwidth.stream`.
 
         Raises
@@ -125,12 +128,12 @@ class Hull:
         """
         if self.memory is None:
             raise Refused(f"`{typed(self)}` has no online form: it keeps all rows", hint="Hull(memory=10)")
-        return _Live(self, model, t)
+        from halfwidth.methods._hull_live import Live
+
+        return Live(self, model, t)
 
 
-def run(
-    method: Hull, model: Model, record: Record, proposers: Sequence[Proposer | None] = _PROPOSERS
-) -> Estimate:
+def run(method: Hull, model: Model, record: Record, proposers: Sequence[Proposer | None] = PROPOSERS) -> Estimate:
     """Bound the states of a record with the given proposers of multipliers, none of which is trusted."""
     lo, hi = outer(model, len(record))
     if isinstance(model, Linear):
@@ -157,42 +160,53 @@ def _bounded(
     """Bound the states by rows, from boxes (T + 1, nx) that are safe already."""
     nx = model.nx
     boxes = Boxes(rows, lo.copy(), hi.copy(), proposers)
-    out_lo, out_hi, empty = _narrowed(method, boxes, record.seen)
+    out_lo, out_hi, empty = narrowed(method, boxes, record.seen)
     info: dict[str, Any] = {"loose": boxes.loose, "sides": boxes.asked, "x0_lo": boxes.lo[0], "x0_hi": boxes.hi[0]}
     if empty is not None:
-        names = (_names(model.names.x, "x", nx), _names(record.labels.outputs or model.names.y, "y", model.ny))
+        names = (names_of(model.names.x, "x", nx), names_of(record.labels.outputs or model.names.y, "y", model.ny))
         conflict = conflict_of(rows, lo, hi, record.t, empty, names)
         info |= {"message": conflict.message, "conflict": conflict.rows, "growth": conflict.growth}
         info |= {"proved": conflict.proved, "hint": _hint(conflict)}
         x = _somewhere(out_lo, out_hi, empty.b, conflict)
-        return Estimate(
-            record.t, x, None, Status.INFEASIBLE, typed(method), q=model.w.q, r=model.e.q,  # type: ignore[union-attr]
-            names=model.names.x, labels=record.labels, info=info,
-        )  # fmt: skip
+        return answer(method, model, record.t, x, None, Status.INFEASIBLE, info, record.labels)
     box = Box(out_lo, out_hi, guaranteed=True)
     status = Status.REDUCED if boxes.loose else Status.OK
     if boxes.loose:
         info["message"] = f"{status.value}: {boxes.loose} of {boxes.asked} sides are proved but loose"
-    return Estimate(
-        record.t, _middle(box), box, status, typed(method), q=model.w.q, r=model.e.q,  # type: ignore[union-attr]
-        names=model.names.x, labels=record.labels, info=info,
-    )  # fmt: skip
+    return answer(method, model, record.t, middle(box), box, status, info, record.labels)
+
+
+def answer(
+    method: Hull,
+    model: Model,
+    t: Array,
+    x: Array,
+    box: Box | None,
+    status: Status,
+    info: dict[str, Any],
+    labels: Labels,
+) -> Estimate:
+    """Return the estimate of a hull: its half-widths are those of the model."""
+    assert isinstance(model.w, Uniform)
+    assert isinstance(model.e, Uniform)
+    q, r = model.w.q, model.e.q
+    return Estimate(t, x, box, status, typed(method), q=q, r=r, names=model.names.x, labels=labels, info=info)
 
 
 def outer(model: Model, T: int) -> tuple[Array, Array]:
     """Return what is known of the states x_0 .. x_T without any row, each (T + 1, nx)."""
     assert isinstance(model.x0, Box)
     lo, hi = np.full((T + 1, model.nx), -np.inf), np.full((T + 1, model.nx), np.inf)
-    if model.bounds is not None:
+    if isinstance(model.bounds, Box):
         lo[1:], hi[1:] = model.bounds.lo, model.bounds.hi
     lo[0], hi[0] = model.x0.lo, model.x0.hi
     return lo, hi
 
 
-def _narrowed(method: Hull, boxes: Boxes, seen: NDArray[np.bool_]) -> tuple[Array, Array, Empty | None]:
-    """Narrow all boxes; return those of x_1 .. x_T as of the rows that count for each, or the proof that there is none."""
+def narrowed(method: Hull, boxes: Boxes, seen: NDArray[np.bool_]) -> tuple[Array, Array, Empty | None]:
+    """Narrow all boxes; return those of x_1 .. x_T by the rows that count for each, or the proof that there is none."""
     memory, lag = method.memory, 0 if method.lag is None else int(method.lag)
-    reach = _REACH if memory is None else int(memory)
+    reach = REACH if memory is None else int(memory)
     lo, hi, empty = _forward(boxes, seen, reach, lag)
     if memory is not None or empty is not None:
         return lo, hi, empty
@@ -213,7 +227,7 @@ def _narrowed(method: Hull, boxes: Boxes, seen: NDArray[np.bool_]) -> tuple[Arra
         if empty is not None:
             break
         with np.errstate(invalid="ignore"):
-            live &= ~np.all(before - (hi - lo) <= _GAIN * before, axis=1)
+            live &= ~np.all(before - (hi - lo) <= GAIN * before, axis=1)
     return lo, hi, empty
 
 
@@ -223,7 +237,7 @@ def _forward(
     """Go through the rows once; return the boxes of x_1 .. x_T when their rows were complete."""
     T = boxes.rows.T
     out_lo, out_hi = boxes.lo[1:].copy(), boxes.hi[1:].copy()
-    start = window_starts(seen, reach, fixes=_FIXES, stretch=max(reach * _STRETCH, 1))
+    start = window_starts(seen, reach, fixes=FIXES, stretch=max(reach * STRETCH, 1))
     windows: list[tuple[int, int, int]] = []
     for row in range(T):
         done = range(max(0, row - lag), T) if row == T - 1 else [row - lag] if row >= lag else []
@@ -248,9 +262,9 @@ def _backward(boxes: Boxes, seen: NDArray[np.bool_], reach: int) -> Empty | None
     T = boxes.rows.T
     live = np.ones(T + 1, dtype=bool)
     while True:
-        longest = max(reach * _STRETCH, 1)
-        start = window_starts(seen, reach, fixes=_FIXES, stretch=longest)
-        stop = T - window_starts(seen[::-1], reach, fixes=_FIXES, stretch=longest)[::-1]
+        longest = max(reach * STRETCH, 1)
+        start = window_starts(seen, reach, fixes=FIXES, stretch=longest)
+        stop = T - window_starts(seen[::-1], reach, fixes=FIXES, stretch=longest)[::-1]
         with np.errstate(invalid="ignore"):
             before = boxes.hi - boxes.lo
         empty = boxes.sweep(
@@ -264,14 +278,14 @@ def _backward(boxes: Boxes, seen: NDArray[np.bool_], reach: int) -> Empty | None
         if reach >= T:
             return None
         with np.errstate(invalid="ignore"):
-            gained = ~(before - (boxes.hi - boxes.lo) <= _GAIN * before)
-        live = live & (gained.any(axis=1) | (reach == _REACH))
+            gained = ~(before - (boxes.hi - boxes.lo) <= GAIN * before)
+        live = live & (gained.any(axis=1) | (reach == REACH))
         if not live.any():
             return None
         reach *= 2
 
 
-def _middle(box: Box) -> Array:
+def middle(box: Box) -> Array:
     """Return the middle of every box; where an end is infinite the finite end, or 0."""
     return np.clip(box.mean, box.lo, box.hi)
 
@@ -279,7 +293,7 @@ def _middle(box: Box) -> Array:
 def _somewhere(lo: Array, hi: Array, b: int, conflict: Conflict) -> Array:
     """Return finite states of an infeasible record: a trajectory that needs the growth, else the last safe boxes."""
     T = len(lo)
-    x = _middle(Box(np.minimum(lo, hi), np.maximum(lo, hi)))
+    x = middle(Box(np.minimum(lo, hi), np.maximum(lo, hi)))
     if conflict.x is not None:
         x[conflict.first : conflict.first + len(conflict.x)] = conflict.x
         x[conflict.first + len(conflict.x) :] = conflict.x[-1]
@@ -294,235 +308,6 @@ def _hint(conflict: Conflict) -> str:
     return "leave the rows of info['conflict'] away, or multiply the half-widths of w and e by the growth"
 
 
-def _names(given: Sequence[str], symbol: str, n: int) -> tuple[str, ...]:
+def names_of(given: Sequence[str], symbol: str, n: int) -> tuple[str, ...]:
+    """Return n names: those given, or the symbol with numbers."""
     return tuple(given) if len(given) == n else tuple(f"{symbol}{k}" for k in range(n))
-
-
-# ---- functionals ------------------------------------------------------------------------------------------------------
-
-
-class Bound(NamedTuple):
-    """Guaranteed interval of a functional c'x.
-
-    Attributes
-    ----------
-    lo, hi : float or (T,) array
-    """
-
-    lo: Any
-    hi: Any
-
-    def excess(self, value: ArrayLike, half_width: ArrayLike = 0.0) -> Any:
-        """Return how far ``value +- half_width`` lies outside, 0 where it does not.
-
-        Above 0 it cannot be: no trajectory that obeys the bounds gives this value. So much wider would the half-width
-        have to be.
-        """
-        below = np.nextafter(np.nextafter(np.asarray(self.lo) - value, -np.inf) - half_width, -np.inf)
-        above = np.nextafter(np.nextafter(np.asarray(value) - self.hi, -np.inf) - half_width, -np.inf)
-        found = np.maximum(np.maximum(below, above), 0.0)
-        return float(found) if found.ndim == 0 else found
-
-
-def bound(model: Linear, record: Record, c: ArrayLike, *, at: int | None = None) -> Bound:
-    """Return the guaranteed interval of c'x[t] from all rows of a record.
-
-    Parameters
-    ----------
-    model : Linear
-        One that `Hull` takes.
-    record : Record
-    c : (nx,) array_like
-        The functional, such as a row of C for an output, or the difference of two states.
-    at : int, optional
-        Row of the record, -1 for the last; all rows if absent.
-
-    Returns
-    -------
-    Bound
-        Of floats, or of (T,) arrays without `at`.
-
-    Raises
-    ------
-    Refused
-        If `Hull` does not take the model.
-    Unsolved
-        If no trajectory fits the data at all.
-
-    Examples
-    --------
-    The outputs say 0 +- 0.5 and, two steps of at most 1 later, cannot be 4:
-
-    >>> import halfwidth as hw
-    >>> walk = hw.Linear([[1]], None, [[1]], hw.Uniform(1.0), hw.Uniform(0.5), None)
-    >>> where = hw.bound(walk, hw.Record([0.0, 1.0, 2.0], [0.0, None, None]), [1.0], at=2)
-    >>> round(where.hi, 6), round(where.excess(4.0, 0.5), 6)
-    (2.5, 1.0)
-    """
-    from halfwidth.estimate import choose, fits
-
-    method = Hull()
-    if not isinstance(model, Linear):
-        raise Refused("`bound` needs a linear model but the model is nonlinear", hint="estimate(model, record, Hull())")
-    choose(model, method)
-    fits(model, record)
-    row = _functional(c, model.nx)
-    T = len(record)
-    if at is not None and not -T <= at < T:
-        raise BadValue(f"`at` is {at!r}, a row from {-T} to {T - 1} was expected")
-    lo, hi = outer(model, T)
-    boxes = Boxes(interval_rows(model, record), lo, hi, _PROPOSERS)
-    _, _, empty = _narrowed(method, boxes, record.seen)
-    if empty is not None:
-        run(method, model, record).check()
-    wanted = range(T) if at is None else [at % T]
-    found = np.array([_widened(boxes, row, k + 1) for k in wanted])
-    return Bound(found[:, 0], found[:, 1]) if at is None else Bound(float(found[0, 0]), float(found[0, 1]))
-
-
-def _functional(c: ArrayLike, nx: int) -> Array:
-    row = np.atleast_1d(real(c, "c"))
-    if row.shape != (nx,):
-        raise BadShape(f"`c` has shape {row.shape}, ({nx},) was expected from the model")
-    return of_size(row, nx, "c", "the model")
-
-
-def _widened(boxes: Boxes, c: Array, state: int) -> tuple[float, float]:
-    """Return bounds of c'x at one state from ever wider windows, until that gains nothing."""
-    T, reach = boxes.rows.T, _REACH
-    lo, hi = boxes.functional(max(0, state - reach), min(T, state + reach), c, state)
-    while reach < max(state, T - state):
-        reach *= 2
-        before = hi - lo
-        new = boxes.functional(max(0, state - reach), min(T, state + reach), c, state)
-        lo, hi = max(lo, new[0]), min(hi, new[1])
-        if before - (hi - lo) <= _GAIN * before:
-            break
-    return lo, hi
-
-
-# ---- on line ----------------------------------------------------------------------------------------------------------
-
-
-class _Live:
-    """A hull fed row by row: it keeps the rows and boxes that the next window may need, nothing else."""
-
-    def __init__(self, hull: Hull, model: Linear, t: float) -> None:
-        self.hull, self.model, self.t, self.pushed = hull, model, t, 0
-        self.method, self.ends = typed(hull), theta_ends(model)
-        self.times: list[float] = []
-        self.seen = np.zeros((0, model.ny), dtype=bool)
-        lo, hi = outer(model, 1)
-        self.free = lo[1:], hi[1:]
-        self.lo, self.hi = lo[:1], hi[:1]
-        self.rows: Rows | None = None
-        self.empty: str | None = None
-
-    def push(self, y: ArrayLike | None, u: ArrayLike | None = None, dt: float | None = None) -> Estimate:
-        """Fold one row in and return the newest estimate, of `lag` rows ago."""
-        model = self.model
-        row, inputs, step = pushed_row(model, y, u, dt)
-        t = self.t + step
-        rows = self._with(row, inputs, t, step)
-        self.t = t
-        self.pushed += 1
-        if self.empty is not None:
-            return self._infeasible(self.empty)
-        times, seen = [*self.times, t], np.vstack((self.seen, ~np.isnan(row)))
-        lag, newest = 0 if self.hull.lag is None else int(self.hull.lag), len(times) - 1
-        wanted = max(newest - lag, 0)
-        start = self._starts(seen)
-        boxes = Boxes(rows, np.vstack((self.lo, self.free[0])), np.vstack((self.hi, self.free[1])), _PROPOSERS)
-        given = boxes.lo.copy(), boxes.hi.copy()
-        done = [wanted] if self.pushed > lag else []
-        a = int(start[wanted]) if done else 0
-        empty = boxes.sweep([(a, newest + 1, k + 1) for k in sorted({newest, *done}, reverse=True)])[3]
-        if empty is not None:
-            names = (_names(model.names.x, "x", model.nx), _names(model.names.y, "y", model.ny))
-            self.empty = conflict_of(rows, *given, np.array(times), empty, names).message
-            return self._infeasible(self.empty)
-        self.rows, self.times, self.seen, self.lo, self.hi = rows, times, seen, boxes.lo, boxes.hi
-        state = wanted + 1
-        box = Box(self.lo[state : state + 1].copy(), self.hi[state : state + 1].copy(), guaranteed=True)
-        when = np.array([self.times[wanted]])
-        info = {"rows": self.pushed, "loose": boxes.loose, "sides": boxes.asked}
-        self._forget(a)
-        status = Status.REDUCED if boxes.loose else Status.OK
-        return Estimate(when, _middle(box), box, status, self.method, q=model.w.q, r=model.e.q,  # type: ignore[union-attr]
-                        names=model.names.x, info=info)  # fmt: skip
-
-    def bound(self, c: ArrayLike, u: ArrayLike | None = None, dt: float | None = None) -> Bound:
-        """Return the guaranteed interval of c'x at the next row, before its outputs are seen."""
-        row, inputs, step = pushed_row(self.model, None, u, dt)
-        c = _functional(c, self.model.nx)
-        if self.empty is not None:
-            self._infeasible(self.empty).check()
-        rows = self._with(row, inputs, self.t + step, step)
-        boxes = Boxes(rows, np.vstack((self.lo, self.free[0])), np.vstack((self.hi, self.free[1])), _PROPOSERS)
-        last = rows.T
-        boxes.narrow(max(0, last - int(self.hull.memory or last)), last, last)
-        return Bound(*boxes.functional(0, last, c, last))
-
-    def _with(self, y: Array, u: Array | None, t: float, dt: float) -> Rows:
-        """Return the rows held and a new one after them."""
-        pairs = {}
-        for name, matrix in self.model.matrices.items():
-            if matrix.stacked and matrix.value is not None and self.pushed >= len(matrix.value):
-                raise BadValue(f"`{name}` is stacked for {len(matrix.value)} rows, and so many have been pushed")
-            value = matrix.at(t, dt, self.pushed)
-            pairs[name] = ends_of(matrix, value if matrix.constant else value[None], self.ends.get(name))
-        new = rows_of(self.model, pairs, None if u is None else u[None], y[None], ~np.isnan(y)[None])
-        return new if self.rows is None else self.rows.joined(new, self.rows.T)
-
-    def _starts(self, seen: NDArray[np.bool_]) -> NDArray[np.int32]:
-        memory = int(self.hull.memory or 1)
-        return window_starts(seen, memory, fixes=_FIXES, stretch=memory * _STRETCH)
-
-    def _forget(self, a: int) -> None:
-        """Drop what lies before the window: starts never move back, but for states without a bound."""
-        if not (np.isfinite(self.lo[a:]).all() and np.isfinite(self.hi[a:]).all()):
-            a = min(a, max(0, len(self.times) - far_back(self.model.nx)))
-        if a > 0 and self.rows is not None:
-            self.rows = self.rows.part(a, self.rows.T)
-            self.lo, self.hi, self.seen = self.lo[a:], self.hi[a:], self.seen[a:]
-            del self.times[:a]
-
-    def _infeasible(self, message: str) -> Estimate:
-        """Return the answer of a stream whose rows contradict the bounds; it stays so, since nothing is safe any more."""
-        box = Box(self.lo[-1:], self.hi[-1:])
-        model, x = self.model, np.nan_to_num(_middle(box))
-        info = {"rows": self.pushed, "message": message, "hint": "resume a snapshot from before, and push None instead"}
-        return Estimate(np.array([self.t]), x, None, Status.INFEASIBLE, self.method, q=model.w.q, r=model.e.q,  # type: ignore[union-attr]
-                        names=model.names.x, info=info)  # fmt: skip
-
-    def snapshot(self) -> bytes:
-        """Return the rows and boxes held, as bytes; every number exactly."""
-        arrays: dict[str, Any] = {"lo": self.lo, "hi": self.hi}
-        if self.rows is not None:
-            arrays |= {f.name: getattr(self.rows, f.name) for f in dataclasses.fields(self.rows)}
-        held = {name: None if v is None else [list(v.shape), [n.hex() for n in v.ravel().tolist()]] for name, v in arrays.items()}
-        plain = {
-            "t": self.t.hex(), "pushed": self.pushed, "times": [v.hex() for v in self.times], "empty": self.empty,
-            "seen": self.seen.astype(int).tolist(), "arrays": held,
-        }  # fmt: skip
-        return json.dumps(plain).encode()
-
-    def restore(self, saved: bytes) -> None:
-        """Take up the rows and boxes of a snapshot."""
-        plain = json.loads(saved)
-        self.t, self.pushed, self.empty = float.fromhex(plain["t"]), int(plain["pushed"]), plain["empty"]
-        self.times = [float.fromhex(v) for v in plain["times"]]
-        self.seen = np.array(plain["seen"], dtype=bool).reshape(len(self.times), self.model.ny)
-        arrays = {
-            name: None if v is None else np.array([float.fromhex(n) for n in v[1]]).reshape(v[0])
-            for name, v in plain["arrays"].items()
-        }
-        self.lo, self.hi = arrays.pop("lo"), arrays.pop("hi")
-        self.rows = Rows(**arrays) if arrays else None
-        if self.lo.shape != (len(self.times) + 1, self.model.nx) or self.hi.shape != self.lo.shape:
-            raise ValueError("its boxes do not fit the model")
-
-
-
-
-__all__ = ["Bound", "Hull", "bound"]

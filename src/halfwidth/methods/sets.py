@@ -120,7 +120,7 @@ class _Recursion:
     ) -> tuple[SetState, Array, Array, Array]:
         """Run the kernel over some rows: the state after them, boxes and points of each; `inside` bounds all."""
         kind, generators, constraints = self._sizes(model)
-        if inside is None and model.bounds is not None:
+        if inside is None and isinstance(model.bounds, Box):
             inside = model.bounds.lo, model.bounds.hi
         low, high = (None, None) if inside is None else inside
         lo, hi, x, shape, code = _core.sets_run(
