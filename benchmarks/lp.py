@@ -208,16 +208,19 @@ def agreement(problems):
 
     sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
     from tests.core.test_lp import judged
+    from tests.naive_lp import problem
 
-    wrong, helped, kinds = [], {}, {}
+    wrong, helped, statuses = [], {}, {}
     for seed in range(problems):
         kind, fault, help_ = judged(seed)
-        kinds[kind] = kinds.get(kind, 0) + 1
+        status = solve(problem(seed)[1], point="optimal").status.name
+        statuses[status] = statuses.get(status, 0) + 1
         helped[kind] = helped.get(kind, 0) + help_
         if fault:
             wrong.append((seed, kind, fault))
             print(seed, kind, fault)
     print(f"{len(wrong)} of {problems} disagree; stock solvers were needed for {sum(helped.values())}: {helped}")
+    print(f"statuses: {statuses}")
 
 
 def main(quick=False):

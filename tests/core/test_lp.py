@@ -60,10 +60,10 @@ def worth(chain, x, theta):
     M, b, kind = dense(chain)
     given = [Fraction(float(v)) for v in np.r_[x.ravel(), theta]]
     s = [Fraction(float(v)) for v in chain.floor]
-    for row, right, k in zip(M, b, kind):
+    for row, right, k in zip(M, b, kind, strict=True):
         rho = sum((Fraction(float(row[j])) * given[j] for j in np.flatnonzero(row)), -Fraction(float(right)))
         s[chain.group[k]] = max(s[chain.group[k]], abs(rho) / Fraction(float(chain.h[k])))
-    return float(sum(Fraction(float(c)) * v for c, v in zip(chain.c, s)))
+    return float(sum(Fraction(float(c)) * v for c, v in zip(chain.c, s, strict=True)))
 
 
 def judged(seed):

@@ -1,10 +1,10 @@
 """Window: any batch method on a sliding window of the record, one estimate a row.
 
-At row t the method sees rows ``start(t)`` to t only, so the cost of a row does not grow and old data are forgotten. A
+At row t the method sees rows ``start(t)`` to t only: the cost of a row does not grow and old data are forgotten. A
 window holds the newest ``memory + 1`` rows in which anything is seen: it **stretches** over a gap, and reaches further
 back until every output that is ever seen has ``fixes`` seen entries in it. A row in which nothing is seen says nothing
-new: the estimate moves on along the model, which ``info["extrapolated"]`` says, and the first fix after an outage of any
-length meets as many rows on its far side as the memory holds.
+new: the estimate moves on along the model, which ``info["extrapolated"]`` says, and the first fix after an outage of
+any length meets as many rows on its far side as the memory holds.
 
 An optimal point (``BatchLP(point="optimal")``) begins at a well-centred iterate of the window before, moved by a row:
 the optimum is the same within its tolerance, in fewer steps. A central point begins afresh in every window: it is where
@@ -18,8 +18,8 @@ s_hi, for its interval
 with n + 1 the number of estimates; `ensemble_interval` returns it. States in a gap count the windows until ``memory``
 rows after its end, since those inside it all miss the same. On line the windows up to now are carried on by the model
 to the newest row, and an outage adds what their half-widths can add up to. Kappa has no calibrated level: use
-``Posterior`` where a probability is wanted. With ``carry=kappa`` the interval of the state that has just left the window
-bounds the first state of the next one.
+``Posterior`` where a probability is wanted. With ``carry=kappa`` the interval of the state that has just left the
+window bounds the first state of the next one.
 
 References
 ----------
@@ -80,8 +80,8 @@ class Window:
     estimate of each state; ``low``, ``high`` and ``windows``, what `ensemble_interval` needs; ``q``, ``r``, ``theta``
     of every window; ``start``, ``extrapolated``, ``since_fix``, ``statuses``, ``iterations`` and, of ``BatchLP``,
     ``seconds`` of CPU time of every row; ``newest_low``, ``newest_high``, ``newest_windows``, what
-    ``ensemble_interval(newest=True)`` needs. Those of the estimate itself are the last window's; its status is the worst
-    of all windows.
+    ``ensemble_interval(newest=True)`` needs. Those of the estimate itself are the last window's; its status is
+    the worst of all windows.
 
     Raises
     ------

@@ -29,7 +29,7 @@ from halfwidth.array import Array
 from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.result import Status
-from halfwidth.solvers.lp import HIGHS, PIQP, Claim, Program, Solver, Verdict
+from halfwidth.solvers.lp import HIGHS, PIQP, Claim, Program, Solution, Solver, Verdict
 from halfwidth.solvers.lp import solve as proved
 from halfwidth.spread import Box
 from halfwidth.varying import Varying
@@ -38,6 +38,8 @@ Point = Literal["central", "optimal", "least_squares"]
 POINTS: dict[str, int] = {"optimal": 0, "central": 1, "least_squares": 2}
 #: What the core's codes mean.
 STATUSES = (Status.OK, Status.REDUCED, Status.INFEASIBLE, Status.STALLED)
+#: Rows beyond which HiGHS, which may take minutes, is asked only where there is no other answer.
+_LONG = 500
 #: A well-centred iterate: x (T + 1, nx), theta, s, multipliers of rows, of boxes, of the ends of theta and s.
 Start = tuple[Array, Array, Array, Array, Array, Array]
 
@@ -256,19 +258,27 @@ def _arrays(c: Chain) -> tuple[Any, ...]:
 def _proved(chain: Chain, answer: Answer) -> Answer:
     """Return the stock solvers' answer, or the structured one's if they have none that is better."""
     answer = answer._replace(start=None)
-    near = _Near.of(chain, answer)
-    found = proved(near.chain.program(), (PIQP, HIGHS))
-    if found.verdict not in (Verdict.OPTIMAL, Verdict.INFEASIBLE):
-        # Where nothing but rounding is left to explain, the numbers as they were given are the better ones.
-        again = proved(chain.program(), (PIQP, HIGHS))
-        if again.verdict in (Verdict.OPTIMAL, Verdict.INFEASIBLE) or not found.solved:
-            near, found = _Near.as_given(chain, answer), again
-    if found.verdict is Verdict.INFEASIBLE:
-        return answer._replace(status=Status.INFEASIBLE, by=found.solver)
-    if found.x is None or not found.solved:
-        return answer._replace(status=Status.STALLED)
-    if found.verdict is Verdict.REDUCED and answer.status is Status.REDUCED:
-        return answer
+    found: Solution | None = None
+    near = moved = _Near.of(chain, answer)
+    given = _Near.as_given(chain, answer)  # better where nothing but rounding is left to explain
+    # Half-widths without a cap can always grow, and a point that keeps within the caps has been found.
+    feasible = answer.status is Status.REDUCED or not np.isfinite(chain.cap).any()
+    value = answer.objective if answer.status is Status.REDUCED else np.inf
+    for where, solver in ((moved, PIQP), (moved, HIGHS), (given, PIQP), (given, HIGHS)):
+        if solver is HIGHS and chain.T > _LONG and value < np.inf:
+            continue
+        one = proved(where.chain.program(), (solver,))
+        if one.verdict is Verdict.INFEASIBLE and not feasible:
+            return answer._replace(status=Status.INFEASIBLE, by=one.solver)
+        best = found is not None and found.verdict is Verdict.OPTIMAL
+        lower = one.objective * where.size < value * (1.0 - 1e-9)
+        if (one.verdict is Verdict.OPTIMAL and (lower or not best)) or (one.solved and lower and not best):
+            near, found, value = where, one, one.objective * where.size
+        # An interior point's dual residual is worth more than it says where states can be large: ask for a vertex too.
+        if one.verdict is Verdict.OPTIMAL and (solver is HIGHS or chain.T > _LONG):
+            break
+    if found is None or found.x is None:
+        return answer if answer.status is Status.REDUCED else answer._replace(status=Status.STALLED)
     T, nx = chain.bx.shape
     n, p0, ns = (T + 1) * nx, len(answer.theta), len(chain.c)
     x, theta, s, e = np.split(found.x, [n, n + p0, n + p0 + ns])
@@ -297,7 +307,7 @@ class _Near(NamedTuple):
     """A chain measured from a point close to its optimum, in units in which all its numbers are near 1.
 
     `x` (nx,), `theta` (p0,), `s` (ns,) and `row` (nx + ny,) are these units: states are ``point + x x'``, parameters
-    ``at + theta theta'``, residuals ``row rho'``.
+    ``at + theta theta'``, residuals ``row rho'``, the objective ``size`` times its.
     """
 
     chain: Chain
@@ -307,6 +317,7 @@ class _Near(NamedTuple):
     theta: Array
     s: Array
     row: Array
+    size: float
 
     @classmethod
     def of(cls, c: Chain, answer: Answer) -> "_Near":
@@ -341,7 +352,7 @@ class _Near(NamedTuple):
             c=np.where(c.c > 0, 1.0, 0.0), floor=c.floor / s, cap=c.cap / s, G=None if G is None else G * theta,
             slack=None if c.slack is None else c.slack * row / size, **ends,
         )  # fmt: skip
-        return cls(chain, answer.x, answer.theta, x, theta, s, row)
+        return cls(chain, answer.x, answer.theta, x, theta, s, row, size)
 
     @classmethod
     def as_given(cls, c: Chain, answer: Answer) -> "_Near":
@@ -349,7 +360,7 @@ class _Near(NamedTuple):
         one = np.ones(len(c.h))
         return cls(
             c, np.zeros_like(answer.x), np.zeros_like(answer.theta), np.ones(c.bx.shape[1]), np.ones_like(answer.theta),
-            np.ones_like(c.c), one,
+            np.ones_like(c.c), one, 1.0,
         )  # fmt: skip
 
 
