@@ -32,7 +32,7 @@ PIECE, MOST_PIECES, PAUSE = 150.0, 40, 30.0
 FEWEST, LEAST_WAY = 20, 30.0
 
 #: Offsets are looked for this far either way, s, and are observable when their standard deviation is below, s.
-WIDEST, OBSERVABLE = 2.5, 0.1
+WIDEST, OBSERVABLE = 2.5, 0.15
 
 #: An antenna off the axle is believed when it is this many standard deviations off, known to this many metres, and the
 #: slow error of the fixes moves by less than this many metres in the time of a turn (10 s).
@@ -319,6 +319,7 @@ def _joined(known: Calibration, pieces: Sequence[reckoning.Piece], there: Sequen
         bias_sd=float(weight.sum() ** -0.5) if yaw_known else float("inf"),
         bias_at=tuple(zip(middle, bias.tolist(), strict=True)) if yaw_known and len(pieces) > 1 else (),
         slip=float(np.median([piece.sigma[1] for piece in pieces])),
+        noise=tuple(np.median([piece.sigma for piece in pieces], axis=0).tolist()),
     )
 
 

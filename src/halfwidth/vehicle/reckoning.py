@@ -11,8 +11,8 @@ seconds moves the axle by V along the middle azimuth and turns it by -W, with
 where the derivatives are differences of the integrals a tenth of a second sooner and later. While the car stands it
 does not turn, and the yaw rate is the bias. A smoother (the core's) gives the most probable state; the streams are
 sampled again with the offsets it found, and so on: Gauss-Newton on the whole piece, so the covariance at the end is the
-inverse curvature of the posterior. The five noise scales are learnt in the same rounds as in `chain`, and each fix has
-the weight of Student's t in them, so that stray fixes do not count.
+inverse curvature of the posterior. The five noise scales are learnt in the same rounds as in `chain`; each fix, and
+each step of the slow offset, has the weight of Student's t in them, so that stray fixes and multipath do not count.
 """
 
 from collections.abc import Mapping
@@ -131,7 +131,7 @@ def solve(
     clock = np.array(clocks if start is None else start.mean[1:3], dtype=np.float64)
     s2 = _START**2 if start is None else start.sigma**2
     azimuth = None if start is None else start.azimuth
-    place, weight = np.zeros(2), np.ones(T)
+    place, weight, slow_weight = np.zeros(2), np.ones(T), np.ones(T)
     prior = PRIOR * np.array([1, *((1e-6,) * 2 if fixed_clocks else (1, 1)), *((1, 1) if antenna else (1e-6,) * 2)])
     seen = np.column_stack((grid.seen, grid.seen, still))
     k = int(np.argmax(grid.seen))
@@ -146,7 +146,7 @@ def solve(
         steps = _steps(grid, streams, clock, still)
         if azimuth is None:
             azimuth = chain.azimuth_of(replace(grid, speed=steps.v, yaw_rate=steps.w))
-        A, b, Q, S, C = _motion(grid, steps, azimuth, s2, still, n)
+        A, b, Q, S, C = _motion(grid, steps, azimuth, s2, s2[3] * grid.h / slow_weight, still, n)
         H, d = _output(azimuth, place, n)
         y[:, 2] = steps.w_raw
         R = np.zeros((T, 3, 3))
@@ -170,8 +170,10 @@ def solve(
         moved = np.clip(x[-1, [SPEED_CLOCK, YAW_CLOCK]], -_STEP, _STEP)
         clock = np.clip(clock + moved, -_FARTHEST, _FARTHEST)
         weight = (_FREEDOM + 2) / (_FREEDOM + square / s2[4])
-        before = s2
-        s2 = _learnt(grid, steps, out["W"], S, C, float(np.sum((weight * square)[grid.seen])), s2)
+        W, before = out["W"], s2
+        wander = (W[:, OFFSET_E, OFFSET_E] + W[:, OFFSET_N, OFFSET_N]) / grid.h
+        slow_weight = (_FREEDOM + 2) / (_FREEDOM + np.maximum(wander, 0.0) / s2[3])
+        s2 = _learnt(grid, steps, W, S, C, float(np.sum((weight * square)[grid.seen])), slow_weight * wander, s2)
         still_moving = np.abs(moved) > 0.1 * np.sqrt(P[-1, [SPEED_CLOCK, YAW_CLOCK], [SPEED_CLOCK, YAW_CLOCK]])
 
         if k >= _LEAST and not still_moving.any() and np.abs(np.log(s2 / before)).max() < _SETTLED:
@@ -230,7 +232,7 @@ def _steps(grid: Grid, streams: Streams, clock: Floats, still: NDArray[np.bool_]
 
 
 def _motion(
-    grid: Grid, steps: _Steps, azimuth: Floats, s2: Floats, still: NDArray[np.bool_], n: int
+    grid: Grid, steps: _Steps, azimuth: Floats, s2: Floats, slow: Floats, still: NDArray[np.bool_], n: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Return ``z[k] = A z[k-1] + b + w`` about the azimuths, cov w, and sine and cosine of the middle azimuth."""
     h, v, w = grid.h, steps.v, steps.w
@@ -263,7 +265,7 @@ def _motion(
     Q[:, E, AZIMUTH] = Q[:, AZIMUTH, E] = C * half * d[:, 2]
     Q[:, N, AZIMUTH] = Q[:, AZIMUTH, N] = -S * half * d[:, 2]
     Q[:, AZIMUTH, AZIMUTH] = d[:, 2]
-    Q[:, OFFSET_E, OFFSET_E] = Q[:, OFFSET_N, OFFSET_N] = s2[3] * h
+    Q[:, OFFSET_E, OFFSET_E] = Q[:, OFFSET_N, OFFSET_N] = slow
     Q[:, SCALE, SCALE], Q[:, BIAS, BIAS] = _SCALE_WALK**2 * h, _BIAS_WALK**2 * h
     A[0], b[0], Q[0] = np.eye(n), 0.0, 0.0
     return A, b, Q, S, C
@@ -306,7 +308,9 @@ def _answer(grid: Grid, x: Floats, P: Floats, clock: Floats, prior: Floats, sigm
     )
 
 
-def _learnt(grid: Grid, steps: _Steps, W: Floats, S: Floats, C: Floats, fixes: float, s2: Floats) -> Floats:
+def _learnt(
+    grid: Grid, steps: _Steps, W: Floats, S: Floats, C: Floats, fixes: float, wander: Floats, s2: Floats
+) -> Floats:
     """Return the squared scales: means of posterior squared residuals over squared weights."""
     half = 0.5 * steps.v * grid.h
     squares = np.empty((len(grid), 4))
@@ -316,7 +320,7 @@ def _learnt(grid: Grid, steps: _Steps, W: Floats, S: Floats, C: Floats, fixes: f
     squares[:, 1] = aside - 2 * half * turned + half**2 * W[:, AZIMUTH, AZIMUTH]
     squares[:, 2] = W[:, AZIMUTH, AZIMUTH]
     squares[:, :3] /= steps.weight2
-    squares[:, 3] = 0.5 * (W[:, OFFSET_E, OFFSET_E] + W[:, OFFSET_N, OFFSET_N]) / grid.h
+    squares[:, 3] = 0.5 * wander
     used = np.ones((len(grid), 4), dtype=bool)
     used[:, :3] = steps.extra == 0
     used[:, 2] &= steps.w == steps.w_raw
