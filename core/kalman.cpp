@@ -5,7 +5,7 @@ namespace hw {
 namespace HW_ISA {
 namespace {
 
-// f(Dim<nx>, Dim<ny>) with both sizes fixed for nx <= 8, ny <= 4; at run time otherwise. A sanitizer build, which takes
+// f(Dim<nx>, Dim<ny>) with both sizes fixed for nx <= 8, ny <= 4 and for (9, 2); at run time otherwise. A sanitizer build, which takes
 // ten times longer to compile, has a few of the same templates.
 template <int N, class F>
 inline void with_outputs(int ny, F f) {
@@ -32,6 +32,7 @@ inline void with_sizes(int nx, int ny, F f) {
         case 6: return with_outputs<6>(ny, f);
         case 7: return with_outputs<7>(ny, f);
         case 8: return with_outputs<8>(ny, f);
+        case 9: if (ny == 2) return f(Dim<9>(), Dim<2>()); break;  // the chain of a vehicle
 #endif
         default: break;
     }
