@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from halfwidth.vehicle import chain
 from halfwidth.vehicle.grid import Grid
+from halfwidth.vehicle.pointing import azimuth_of
 from halfwidth.vehicle.sensors import Calibration
 
 Floats = NDArray[np.float64]
@@ -43,6 +44,9 @@ _MOST, _LOOKS, _ROUNDS = 150, 3, 5
 #: Places where nobody doubts that show what is usual: about so many, and at least; the quantile of how far they are off
 #: that counts, and how many times that a stray fix is off; how many times `FAR` where there are too few such places.
 _CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 2.0, 2.0
+
+#: Scale of what the calibration takes to be without noise.
+_NO_NOISE = 1e-4
 
 #: Share of that distance that must be left when both sides of a gap are asked.
 _BOTH = 0.5
@@ -116,10 +120,12 @@ def strays(grid: Grid, sensors: Calibration) -> Strays:
         return _NONE
     settings = chain.Chain(
         rounds=_ROUNDS,
+        drifting=False,
         scale_sd=float(np.clip(_KNOWN * sensors.scale_sd, _SCALE, 0.03)),
         bias_sd=float(np.clip(_KNOWN * sensors.bias_sd, _BIAS, 0.01)),
     )
-    search = _Search(grid, np.flatnonzero(grid.seen), settings, np.array(sensors.noise))
+    noise = np.array([sensors.noise.get(name, _NO_NOISE) for name in chain.GROUPS])
+    search = _Search(grid, np.flatnonzero(grid.seen), settings, noise)
     gaps, jumps = _gaps(grid, search.seen), _jumps(grid, search.seen)
     doubts = gaps[:_MOST]
     for _ in range(_LOOKS):
@@ -305,7 +311,7 @@ def _blocks(grid: Grid, seen: NDArray[np.intp]) -> list[tuple[int, int]]:
 
 def _jumps(grid: Grid, seen: NDArray[np.intp]) -> list[_Doubt]:
     """Return the doubts about what follows a step between fixes that the sensors did not see."""
-    azimuth = chain.azimuth_of(grid)
+    azimuth = azimuth_of(grid)
     middle = 0.5 * (azimuth + np.concatenate((azimuth[:1], azimuth[:-1])))
     way = grid.speed * grid.h
     moved = np.column_stack((np.cumsum(way * np.sin(middle)), np.cumsum(way * np.cos(middle))))[seen]
