@@ -239,8 +239,7 @@ def inflation(found: Sequence[Tested], length: Floats, *, least: float = 1.0) ->
     """Return the factor on the standard deviation for gaps of these lengths.
 
     Between tested lengths it is interpolated in the logarithm of the length; beyond them the nearest counts. Below
-    `least` it is not taken: a model that was too wide on the log's easy stretches is left as it is. Without a test
-    it is `UNTESTED`.
+    `least` it is not taken. Without a test it is `UNTESTED`.
 
     Parameters
     ----------

@@ -460,9 +460,7 @@ def _learnt(rows: _Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Flo
     return np.clip(new, _FLOOR**2, _CEILING**2)
 
 
-def _fit(
-    rows: _Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain
-) -> Fit:
+def _fit(rows: _Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain) -> Fit:
     part = slice(int(rows.offsets[i]), int(rows.offsets[i + 1]))
     z, P = out.x[part].copy(), out.P[part]
     z[:, [E, N]] += rows.origin[i]
