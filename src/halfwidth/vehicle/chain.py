@@ -265,7 +265,7 @@ def _rows(drives: Sequence[Grid]) -> _Rows:
 
 
 def _in_gap(drive: Grid) -> Mask:
-    """Return the steps between fixes that are much further apart than usual, and before the first and after the last."""
+    """Return the steps between fixes much further apart than usual, and before the first and after the last."""
     seen = np.flatnonzero(drive.seen)
     after = np.searchsorted(seen, np.arange(len(drive)))
     apart = np.concatenate(([np.inf], np.diff(drive.t[seen]), [np.inf]))

@@ -31,7 +31,7 @@ from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log
-from halfwidth.vehicle.path import Path
+from halfwidth.vehicle.path import Path, sized
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
 
 Floats = NDArray[np.float64]
@@ -420,7 +420,7 @@ def _estimated(
             *(["cv"] if blind else []),
         ]
         for name in names:
-            own, again, _ = _ran(METHODS[name], grids, good, [])
+            own, again, _ = _ran(METHODS[name], grids, good, None)
             if all(_plausible(path, grids[i]) for i, path in own.items()):
                 rivals[name] = _Rival(own, again)
     bridges: list[_Bridge] = []
@@ -526,19 +526,20 @@ def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, f
 
 
 def _ran(
-    chosen: Method, grids: list[Grid], able: Sequence[int], messages: list[str]
+    chosen: Method, grids: list[Grid], able: Sequence[int], messages: list[str] | None
 ) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
     """Run a method on the pieces that have enough fixes."""
     return _chain(chosen, grids, able, messages) if chosen.name in COLOURS else _plain(chosen, grids, able)
 
 
 def _chain(
-    chosen: Method, grids: list[Grid], able: Sequence[int], messages: list[str]
+    chosen: Method, grids: list[Grid], able: Sequence[int], messages: list[str] | None
 ) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
-    """Solve the chain, of which the fixes that it cannot believe are taken away."""
+    """Solve the chain, of which the fixes that it cannot believe are taken away; without `messages` they are already."""
     colour = COLOURS[chosen.name]
     stray: list[float] = []
-    todo = list(able)
+    todo = list(able) if messages is not None else []
+    messages = [] if messages is None else messages
     for _ in range(_SCREENINGS):
         screened = zip(todo, chain.solve([grids[i] for i in todo], _STIFF), strict=True)
         hidden = {i: _stray(fit.path, grids[i]) for i, fit in screened}
@@ -603,7 +604,7 @@ def _plain(
     tuned = chosen.tune(grids[max(able, key=lambda i: len(grids[i]))]) if able else {}
 
     def rerun(which: Sequence[int], hidden: Sequence[Grid], afresh: bool) -> list[Path]:  # noqa: ARG001
-        return [_with_variance(p, g) for p, g in zip(chosen.run(hidden, tuned), hidden, strict=True)]
+        return [sized(p, g) for p, g in zip(chosen.run(hidden, tuned), hidden, strict=True)]
 
     settings: dict[str, object] = {f"{_words(name)} noise": float(f"{value:.3g}") for name, value in tuned.items()}
     return dict(zip(able, rerun(able, [grids[i] for i in able], True), strict=True)), rerun, settings
@@ -653,27 +654,6 @@ def _top_speed(grid: Grid) -> float:
         moved = np.hypot(np.diff(grid.east[seen]), np.diff(grid.north[seen]))
         fastest = max(fastest, float(np.quantile(moved / step, 0.99)))
     return max(1.5 * fastest, 10.0)
-
-
-def _with_variance(path: Path, grid: Grid) -> Path:
-    """Give a path without a variance the shape of one: it grows with the time to the nearest fix.
-
-    The shape means nothing by itself; hiding fixes gives it its size.
-    """
-    if path.variance is not None:
-        return path
-    fixes = grid.t[grid.seen]
-    k = np.clip(np.searchsorted(fixes, grid.t), 1, max(fixes.size - 1, 1))
-    near = np.minimum(np.abs(grid.t - fixes[k - 1]), np.abs(grid.t - fixes[np.minimum(k, fixes.size - 1)]))
-    sd = 0.3 + 0.5 * near
-    seen = grid.seen
-    off = np.concatenate(((path.east - grid.east)[seen], (path.north - grid.north)[seen]))
-    return replace(
-        path,
-        variance=np.column_stack((sd**2, sd**2)),
-        fix_variance=float(np.mean(off**2)),
-        info={**path.info, "claimed": False},
-    )
 
 
 def _failed_words(chosen: Method, pieces: Sequence[_Piece], n: int) -> str:
