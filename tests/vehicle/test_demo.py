@@ -40,7 +40,7 @@ def test_files_are_there_and_readable(shown):
 
 def test_log_is_the_simulated_drive(shown):
     found, _ = shown
-    _, simulated = simulate_drive(seed=1)
+    _, simulated = simulate_drive(seed=1, fix_offset=0.4, **demo.FAULTS)
     log = read(found.log)
     assert np.array_equal(log.t, simulated.t)
     for name in ("lat_deg", "lon_deg", "speed_mps", "yaw_rate_radps", "azimuth_rad", "ax_mps2"):
@@ -49,7 +49,7 @@ def test_log_is_the_simulated_drive(shown):
 
 def test_score_is_measured_against_the_truth(shown):
     found, _ = shown
-    truth, _ = simulate_drive(seed=1)
+    truth, _ = simulate_drive(seed=1, **demo.FAULTS)
     assert [(tunnel.start, tunnel.stop) for tunnel in found.tunnels] == list(truth.outages)
     for tunnel in found.tunnels:
         inside = (found.track.t_s >= tunnel.start) & (found.track.t_s <= tunnel.stop)
