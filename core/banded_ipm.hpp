@@ -24,6 +24,7 @@
 // after the least-squares start everything is measured from it, in units S of its largest residual.
 #pragma once
 
+#include "carver.hpp"
 #include "chain.hpp"
 #include "lp_types.hpp"
 
@@ -32,23 +33,6 @@ namespace HW_ISA {
 
 constexpr double lp_inf = 1e300;     // bounds at or beyond this are absent
 constexpr double lp_pinned = 1e100;  // added to the diagonal of a variable that must not move
-
-// hands out pieces of the caller's workspace, aligned to 64 bytes; with base == null it only counts
-struct Carver {
-    char* base;
-    std::size_t used = 0;
-    template <class V>
-    V* take(std::ptrdiff_t count) {
-        used = (used + 63) / 64 * 64;
-        V* p = base ? reinterpret_cast<V*>(base + used) : nullptr;
-        used += static_cast<std::size_t>(count) * sizeof(V);
-        return p;
-    }
-    template <class... Vs>
-    void many(std::ptrdiff_t count, Vs*&... arrays) {
-        ((arrays = take<Vs>(count)), ...);
-    }
-};
 
 template <int P, int N>
 struct BandedIpm {

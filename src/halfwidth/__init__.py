@@ -20,7 +20,9 @@ _HOME: dict[str, str] = {
     "Gaussian": "noise",
     "Mixed": "noise",
     "Box": "spread",
+    "Halfspaces": "spread",
     "Normal": "spread",
+    "Both": "spread",
     "Cloud": "spread",
     "Bernoulli": "loss",
     "Markov": "loss",
@@ -38,6 +40,8 @@ _HOME: dict[str, str] = {
     "forecast": "forecast",
     "ensemble_interval": "methods.window",
     "choose_memory": "methods.window",
+    "bound": "methods.hull",
+    "Bound": "methods.hull",
     "MemoryChoice": "methods.window",
     "learn": "learn",
     "Learned": "learn",
@@ -77,6 +81,10 @@ if TYPE_CHECKING:
     from halfwidth.loss import Markov as Markov
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.methods.constrain import Constrained as Constrained
+    from halfwidth.methods.hull import Bound as Bound
+    from halfwidth.methods.hull import Hull as Hull
+    from halfwidth.methods.hull import bound as bound
     from halfwidth.methods.kalman import KalmanFilter as KalmanFilter
     from halfwidth.methods.kalman import KalmanSmoother as KalmanSmoother
     from halfwidth.methods.loss import BKF1 as BKF1
@@ -87,10 +95,16 @@ if TYPE_CHECKING:
     from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
     from halfwidth.methods.loss import Runnalls as Runnalls
     from halfwidth.methods.map import BatchLP as BatchLP
+    from halfwidth.methods.mixed import MixedFilter as MixedFilter
+    from halfwidth.methods.mixed_window import MixedWindow as MixedWindow
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
     from halfwidth.methods.sequential import SequentialLP as SequentialLP
+    from halfwidth.methods.sets import ConstrainedZonotopeFilter as ConstrainedZonotopeFilter
+    from halfwidth.methods.sets import EllipsoidFilter as EllipsoidFilter
+    from halfwidth.methods.sets import IntervalFilter as IntervalFilter
+    from halfwidth.methods.sets import ZonotopeFilter as ZonotopeFilter
     from halfwidth.methods.window import MemoryChoice as MemoryChoice
     from halfwidth.methods.window import Window as Window
     from halfwidth.methods.window import choose_memory as choose_memory
@@ -105,10 +119,12 @@ if TYPE_CHECKING:
     from halfwidth.result import Status as Status
     from halfwidth.score import score as score
     from halfwidth.simulate import simulate as simulate
+    from halfwidth.spread import Both as Both
     from halfwidth.spread import Box as Box
     from halfwidth.spread import Cloud as Cloud
+    from halfwidth.spread import Halfspaces as Halfspaces
     from halfwidth.spread import Normal as Normal
     from halfwidth.stream import resume as resume
     from halfwidth.stream import stream as stream
 
-lazy(__name__, _HOME | {"vehicle": "vehicle"})
+lazy(__name__, _HOME | {"vehicle": "vehicle", "fusion": "fusion"})

@@ -400,7 +400,7 @@ def doctor(json_: Json = False) -> int:
 
 @app.command(epilog="Example: halfwidth reproduce 003 --quick")
 def reproduce(
-    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000 or 003.")],
+    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000, 001, 003 or 004.")],
     quick: Annotated[bool, typer.Option("--quick", help="A small part of each experiment.")] = False,
     json_: Json = False,
 ) -> int:
