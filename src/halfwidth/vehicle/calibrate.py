@@ -199,7 +199,7 @@ def _judged(
     z: float,
     independent: int,
 ) -> Tested | None:
-    factors, weights, means, largest, inside, halves = [], [], [], [], [], []
+    factors, means, largest, inside, halves = [], [], [], [], []
     for (i, _, stretches), path in zip(cases, paths, strict=True):
         drive = drives[i]
         if not path.finite or path.variance is None:
@@ -210,7 +210,6 @@ def _judged(
             sd = np.sqrt(np.maximum(path.variance[part][seen] + path.fix_variance, 1e-12))
             needed = np.abs(error / (z * sd)).ravel()
             factors.append(needed)
-            weights.append(np.full(needed.size, 1.0 / needed.size))
             distance = np.hypot(error[:, 0], error[:, 1])
             means.append(distance.mean())
             largest.append(distance.max())
@@ -219,11 +218,7 @@ def _judged(
     n = len(factors)
     if n < FEWEST:
         return None
-    factor, weight = np.concatenate(factors), np.concatenate(weights)
-    order = np.argsort(factor)
-    share = np.cumsum(weight[order]) / n
-    at = min(int(np.searchsorted(share, min(level * (1 + 1 / (independent * n)), 1.0 - 1e-9))), factor.size - 1)
-    inflation = float(factor[order][at])
+    inflation = quantile(factors, level, independent)
     return Tested(
         length,
         n,
@@ -235,12 +230,36 @@ def _judged(
     )
 
 
+def quantile(needed: Sequence[Floats], level: float, independent: int = _PER_STRETCH) -> float:
+    """Return the factor that covers a share of the hidden fixes, each stretch counting the same.
+
+    Parameters
+    ----------
+    needed : sequence of arrays
+        For each stretch the factors that just reach its fixes.
+    level : float
+        Wanted share.
+    independent : int
+        Errors of one stretch that count as independent.
+
+    Returns
+    -------
+    float
+    """
+    n = len(needed)
+    factor = np.concatenate(needed)
+    weight = np.concatenate([np.full(one.size, 1.0 / max(one.size, 1)) for one in needed])
+    order = np.argsort(factor)
+    share = np.cumsum(weight[order]) / n
+    at = min(int(np.searchsorted(share, min(level * (1 + 1 / (independent * n)), 1.0 - 1e-9))), factor.size - 1)
+    return float(factor[order][at])
+
+
 def inflation(found: Sequence[Tested], length: Floats, *, least: float = 1.0) -> Floats:
     """Return the factor on the standard deviation for gaps of these lengths.
 
     Between tested lengths it is interpolated in the logarithm of the length; beyond them the nearest counts. Below
-    `least` it is not taken: a model that was too wide on the log's easy stretches is left as it is. Without a test
-    it is `UNTESTED`.
+    `least` it is not taken. Without a test it is `UNTESTED`.
 
     Parameters
     ----------
