@@ -32,6 +32,7 @@ from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path, sized
+from halfwidth.vehicle.stray import strays
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
 
 Floats = NDArray[np.float64]
@@ -120,6 +121,10 @@ def fill(
     chosen = _chosen(grid, asked, messages)
     wanted, quality = _wanted(drive_log)
     t = drive_log.t[wanted]
+    if distrust:
+        stray = strays(grid, sensors)
+        messages.extend(filter(None, [stray.words(grid)]))
+        grid = stray.masked(grid)
     pieces = _pieces(grid, drive_log)
     spans = _spans(drive_log, grid, chosen, t, quality)
     free = asked is None or asked.name != chosen.name

@@ -155,17 +155,18 @@ def sampled(
     east[at], north[at] = frame.to_local(log.lat_deg[kept], log.lon_deg[kept])
     seen[at] = True
     arm_east, arm_north = sensors.arm(t)
-    mean = {name: means(t, clock + clock_offset, values, *DRIFT[name]) for name, (clock, values) in streams.items()}
+    streams = {name: (clock + clock_offset, values) for name, (clock, values) in streams.items()}
+    sd = {name: silence(t, clock, *DRIFT[name]) for name, (clock, _) in streams.items()}
     return Grid(
         t=t,
         east=east - arm_east,
         north=north - arm_north,
         seen=seen,
         course=_course(*sensors.stream(log, "azimuth"), t, seen),
-        speed=mean["speed"][0],
-        yaw_rate=mean["yaw_rate"][0],
-        speed_sd=mean["speed"][1],
-        yaw_rate_sd=mean["yaw_rate"][1],
+        speed=means(t, *streams["speed"]),
+        yaw_rate=means(t, *streams["yaw_rate"]),
+        speed_sd=sd["speed"],
+        yaw_rate_sd=sd["yaw_rate"],
         has_speed=streams["speed"][0].size > 0,
         has_yaw_rate=streams["yaw_rate"][0].size > 0,
         frame=frame,
@@ -197,8 +198,8 @@ def _nodes(log: Log, t_fix: Floats, clocks: list[Floats]) -> Floats:
     return np.sort(np.concatenate((marks, first + k * np.repeat(pause / (n + 1), n))))
 
 
-def means(t: Floats, clock: Floats, values: Floats, rate: float, most: float) -> tuple[Floats, Floats]:
-    """Return the mean of a sensor over each step, and its standard deviation where the sensor was silent.
+def means(t: Floats, clock: Floats, values: Floats) -> Floats:
+    """Return the mean of a sensor over each step.
 
     Parameters
     ----------
@@ -206,17 +207,14 @@ def means(t: Floats, clock: Floats, values: Floats, rate: float, most: float) ->
         Nodes, s.
     clock, values : (n,) arrays
         Times, s, and samples.
-    rate, most : float
-        How fast the quantity changes while the sensor is silent, a second, and by how much at most.
 
     Returns
     -------
-    mean, sd : (T,) arrays
+    (T,) array
         Over the step that ends in each node; the first repeats the second.
     """
     if clock.size == 0 or t.size < 2:
-        level = float(values.mean()) if clock.size else 0.0
-        return np.full(t.size, level), np.zeros(t.size)
+        return np.full(t.size, float(values.mean()) if clock.size else 0.0)
     if clock.size == 1:
         clock, values = np.array([clock[0], clock[0] + 1e-3]), np.repeat(values, 2)
     step = np.diff(clock)
@@ -227,15 +225,30 @@ def means(t: Floats, clock: Floats, values: Floats, rate: float, most: float) ->
     # beyond its ends the sensor is taken to stay where it was
     total += np.minimum(t - clock[0], 0.0) * values[0] + np.maximum(t - clock[-1], 0.0) * values[-1]
     mean = np.diff(total) / np.diff(t)
-    return np.concatenate((mean[:1], mean)), _silence(t, clock, rate, most)
+    return np.concatenate((mean[:1], mean))
 
 
-def _silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
-    """Return the standard deviation of each step's mean where the sensor was silent for long.
+def silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
+    """Return the standard deviation of each step's mean where the sensor was silent for long, 0 elsewhere.
 
     The steps of one silence err together, while an estimator takes them as independent. So each is given the share of
     variance that makes the whole silence come out right: sd^2 * (length of the silence) / (length of the step).
+
+    Parameters
+    ----------
+    t : (T,) array
+        Nodes, s.
+    clock : (n,) array
+        Times of the samples, s.
+    rate, most : float
+        How fast the quantity changes while the sensor is silent, a second, and by how much at most.
+
+    Returns
+    -------
+    (T,) array
     """
+    if clock.size < 2 or t.size < 2:
+        return np.zeros(t.size)
     step = np.diff(clock)
     limit = max(3.0 * float(np.median(step)), 0.5)
     middle = t.copy()

@@ -11,8 +11,8 @@ seconds moves the axle by V along the middle azimuth and turns it by -W, with
 where the derivatives are differences of the integrals a tenth of a second sooner and later. While the car stands it
 does not turn, and the yaw rate is the bias. A smoother (the core's) gives the most probable state; the streams are
 sampled again with the offsets it found, and so on: Gauss-Newton on the whole piece, so the covariance at the end is the
-inverse curvature of the posterior. The five noise scales are learnt in the same rounds as in `chain`, and each fix has
-the weight of Student's t in them, so that stray fixes do not count.
+inverse curvature of the posterior. The five noise scales are learnt in the same rounds as in `chain`; each fix, and
+each step of the slow offset, has the weight of Student's t in them, so that stray fixes and multipath do not count.
 """
 
 from collections.abc import Mapping
@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth import _core
-from halfwidth.vehicle import chain
-from halfwidth.vehicle.grid import DRIFT, Grid, means
+from halfwidth.vehicle.grid import DRIFT, Grid, means, silence
+from halfwidth.vehicle.pointing import azimuth_of
 
 Floats = NDArray[np.float64]
 
@@ -32,10 +32,13 @@ E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS, SPEED_CLOCK, YAW_CLOCK, AHEAD, L
 #: The unknowns of the sensors, in the order of `Piece.mean`.
 UNKNOWN = (SCALE, SPEED_CLOCK, YAW_CLOCK, AHEAD, LEFT)
 
+#: Names of the learnt scales, as in `chain`.
+GROUPS = ("longitudinal", "lateral", "yaw", "offset", "fix")
+
 #: Prior standard deviations of speed scale, clocks (s) and antenna (m), and of the bias (rad/s).
 PRIOR, BIAS_SD = np.array([0.05, 0.5, 0.5, 1.0, 1.0]), 0.02
 
-#: Where learning starts, floor and ceiling of the five scales of `chain`.
+#: Where learning starts, floor and ceiling of the five scales.
 _START = np.array([0.1, 0.05, 0.01, 0.3, 0.3])
 _FLOOR = np.array([1e-3, 1e-4, 1e-5, 1e-4, 3e-3])
 _CEILING = np.array([30.0, 3.0, 3.0, 30.0, 1e3])
@@ -44,10 +47,16 @@ _CEILING = np.array([30.0, 3.0, 3.0, 30.0, 1e3])
 _FREEDOM, _MEMORY = 4.0, 60.0
 
 #: Walks of scale and bias a root second.
-_SCALE_WALK, _BIAS_WALK = 1e-4, 1e-5
+_SCALE_WALK, _BIAS_WALK = 1e-4, 1e-4
 
 #: Half the distance of the samples that give the derivatives, and how far a clock moves in one round at most, s.
 _APART, _STEP = 0.1, 0.4
+
+#: No clock is further off, s.
+_FARTHEST = 5.0
+
+#: Rounds at least, and the change of a squared scale below which no further one is needed.
+_LEAST, _SETTLED = 4, 0.3
 
 Streams = Mapping[str, tuple[Floats, Floats]]
 
@@ -64,12 +73,14 @@ class Piece:
         Speed scale, offset of the speed's and of the yaw rate's clock (s), antenna ahead and to the left (m).
     information : (5, 5) array
         Inverse covariance of these, without what the prior added.
-    bias, bias_sd : float
-        Mean bias, rad/s.
+    bias : (T,) array
+        rad/s.
+    bias_sd : float
+        Standard deviation of its mean, rad/s.
     azimuth : (T,) array
         rad.
     sigma : (5,) array
-        The learnt scales, in the order of `chain.GROUPS`.
+        The learnt scales, in the order of `GROUPS`.
     loglik : float
     sound : bool
         Whether the numbers can be used.
@@ -78,7 +89,7 @@ class Piece:
     t: Floats
     mean: Floats
     information: Floats = field(repr=False)
-    bias: float
+    bias: Floats = field(repr=False)
     bias_sd: float
     azimuth: Floats = field(repr=False)
     sigma: Floats
@@ -125,7 +136,7 @@ def solve(
     clock = np.array(clocks if start is None else start.mean[1:3], dtype=np.float64)
     s2 = _START**2 if start is None else start.sigma**2
     azimuth = None if start is None else start.azimuth
-    place, weight = np.zeros(2), np.ones(T)
+    place, weight, slow_weight = np.zeros(2), np.ones(T), np.ones(T)
     prior = PRIOR * np.array([1, *((1e-6,) * 2 if fixed_clocks else (1, 1)), *((1, 1) if antenna else (1e-6,) * 2)])
     seen = np.column_stack((grid.seen, grid.seen, still))
     k = int(np.argmax(grid.seen))
@@ -133,47 +144,49 @@ def solve(
     y = np.column_stack((grid.east, grid.north, np.zeros(T)))
     y[:, :2] -= origin
     y[~grid.seen, :2] = 0.0
-    answer: Piece | None = None
-    for _ in range(rounds):
+    found: tuple[Floats, Floats, Floats] | None = None
+    sigma, loglik = np.sqrt(s2), -np.inf
+    n = 11 if antenna else 9  # states; the core has these two sizes compiled
+    for k in range(rounds):
         steps = _steps(grid, streams, clock, still)
         if azimuth is None:
-            azimuth = chain.azimuth_of(replace(grid, speed=steps.v, yaw_rate=steps.w))
-        A, b, Q, S, C = _motion(grid, steps, azimuth, s2, still)
-        H, d = _output(azimuth, place)
+            azimuth = azimuth_of(replace(grid, speed=steps.v, yaw_rate=steps.w))
+        A, b, Q, S, C = _motion(grid, steps, azimuth, s2, s2[3] * grid.h / slow_weight, still, n)
+        H, d = _output(azimuth, place, n)
         y[:, 2] = steps.w_raw
         R = np.zeros((T, 3, 3))
         R[:, 0, 0] = R[:, 1, 1] = s2[4] / weight
         R[:, 2, 2] = steps.gyro_variance
-        x0 = np.zeros(11)
+        x0 = np.zeros(n)
         x0[[AZIMUTH, SCALE]] = azimuth[0], 1.0
         x0[[SPEED_CLOCK, YAW_CLOCK]] = np.array(clocks) - clock
         slow = 0.5 * _MEMORY * s2[3]
-        P0 = np.diag([1e6, 1e6, 10.0, slow, slow, prior[0] ** 2, BIAS_SD**2, *prior[1:] ** 2])
+        P0 = np.diag([1e6, 1e6, 10.0, slow, slow, prior[0] ** 2, BIAS_SD**2, *prior[1:] ** 2])[:n, :n].copy()
         out = _core.kalman_run("smooth", A, None, H, Q, R, y, seen, x0, P0, b=b, d=d, sums=True, threads=1)
         x, P = out["x"], out["P"]
         if int(np.max(out["code"])) >= 3 or not (np.isfinite(x).all() and np.isfinite(P).all()):
             break
-        azimuth, place = x[:, AZIMUTH].copy(), x[-1, [AHEAD, LEFT]].copy()
-        error = y[:, :2] - (np.einsum("tij,tj->ti", H[:, :2], x) + d[:, :2])
-        spread = np.einsum("tij,tjk,tik->t", H[:, :2], P, H[:, :2])
-        square = np.sum(error**2, axis=1) + spread
-        answer = _answer(grid, x, P, clock, prior, azimuth, np.sqrt(s2), float(np.ravel(out["loglik"])[0]))
-        clock = np.clip(clock + np.clip(x[-1, [SPEED_CLOCK, YAW_CLOCK]], -_STEP, _STEP), -5.0, 5.0)
+        azimuth = x[:, AZIMUTH].copy()
+        place = x[-1, AHEAD:].copy() if antenna else place
+        fixes = H[:, :2]
+        error = y[:, :2] - (fixes @ x[:, :, None])[:, :, 0] - d[:, :2]
+        square = np.sum(error**2, axis=1) + np.sum((fixes @ P) * fixes, axis=(1, 2))
+        found, sigma, loglik = (x, P, clock), np.sqrt(s2), float(np.ravel(out["loglik"])[0])
+        moved = np.clip(x[-1, [SPEED_CLOCK, YAW_CLOCK]], -_STEP, _STEP)
+        clock = np.clip(clock + moved, -_FARTHEST, _FARTHEST)
         weight = (_FREEDOM + 2) / (_FREEDOM + square / s2[4])
-        s2 = _learnt(grid, steps, out["W"], S, C, float(np.sum((weight * square)[grid.seen])), s2)
-    if answer is None:
-        return Piece(
-            grid.t,
-            np.array([1.0, *clocks, 0, 0]),
-            np.zeros((5, 5)),
-            0.0,
-            np.inf,
-            np.zeros(T),
-            np.sqrt(s2),
-            -np.inf,
-            False,
-        )
-    return answer
+        W, before = out["W"], s2
+        wander = (W[:, OFFSET_E, OFFSET_E] + W[:, OFFSET_N, OFFSET_N]) / grid.h
+        slow_weight = (_FREEDOM + 2) / (_FREEDOM + np.maximum(wander, 0.0) / s2[3])
+        s2 = _learnt(grid, steps, W, S, C, float(np.sum((weight * square)[grid.seen])), slow_weight * wander, s2)
+        still_moving = np.abs(moved) > 0.1 * np.sqrt(P[-1, [SPEED_CLOCK, YAW_CLOCK], [SPEED_CLOCK, YAW_CLOCK]])
+
+        if k >= _LEAST and not still_moving.any() and np.abs(np.log(s2 / before)).max() < _SETTLED:
+            break
+    if found is None:
+        nothing = np.array([1.0, *clocks, 0.0, 0.0])
+        return Piece(grid.t, nothing, np.zeros((5, 5)), np.zeros(T), np.inf, np.zeros(T), sigma, loglik, False)
+    return _answer(grid, *found, prior, sigma, loglik)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,18 +206,20 @@ class _Steps:
 def _steps(grid: Grid, streams: Streams, clock: Floats, still: NDArray[np.bool_]) -> _Steps:
     h = grid.h
 
-    def mean(name: str, offset: float) -> tuple[Floats, Floats]:
+    def mean(name: str, offset: float) -> Floats:
         t, values = streams[name]
-        return means(grid.t, t + offset, values, *DRIFT[name])
+        return means(grid.t, t + offset, values)
+
+    def lost(name: str, offset: float) -> Floats:
+        return h * silence(grid.t, streams[name][0] + offset, *DRIFT[name])
 
     def shift(name: str, offset: float) -> Floats:
-        sooner, later = (mean(name, offset + by)[0] for by in (-_APART, _APART))
-        return h * (later - sooner) / (2 * _APART)
+        return h * (mean(name, offset + _APART) - mean(name, offset - _APART)) / (2 * _APART)
 
-    (v, lost_v), (w, lost_w) = mean("speed", clock[0]), mean("yaw_rate", clock[1])
+    v, w = mean("speed", clock[0]), mean("yaw_rate", clock[1])
     pace = np.abs(v)
     weight2 = np.column_stack((h * np.clip(pace, 0.02, 1.0), h * np.maximum(pace, 0.05) ** 2, h))
-    lost_v, lost_w = h * lost_v, h * lost_w
+    lost_v, lost_w = lost("speed", clock[0]), lost("yaw_rate", clock[1])
     extra = np.column_stack((lost_v**2, (0.02 * lost_v) ** 2, lost_w**2))
     noise = 1e-3
     if still.sum() > 4:
@@ -222,7 +237,7 @@ def _steps(grid: Grid, streams: Streams, clock: Floats, still: NDArray[np.bool_]
 
 
 def _motion(
-    grid: Grid, steps: _Steps, azimuth: Floats, s2: Floats, still: NDArray[np.bool_]
+    grid: Grid, steps: _Steps, azimuth: Floats, s2: Floats, slow: Floats, still: NDArray[np.bool_], n: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Return ``z[k] = A z[k-1] + b + w`` about the azimuths, cov w, and sine and cosine of the middle azimuth."""
     h, v, w = grid.h, steps.v, steps.w
@@ -231,8 +246,8 @@ def _motion(
     S, C, vh = np.sin(middle), np.cos(middle), v * h
     turns = np.where(still, 0.0, h)  # what a bias adds to the turn
     T = h.size
-    A = np.zeros((T, 11, 11))
-    A[:, range(11), range(11)] = 1.0
+    A = np.zeros((T, n, n))
+    A[:, range(n), range(n)] = 1.0
     for row, along, aside in ((E, S, C), (N, C, -S)):
         A[:, row, AZIMUTH] = aside * vh
         A[:, row, SCALE] = along * vh
@@ -241,46 +256,45 @@ def _motion(
         A[:, row, YAW_CLOCK] = 0.5 * aside * vh * steps.yaw_shift
     A[:, AZIMUTH, BIAS], A[:, AZIMUTH, YAW_CLOCK] = turns, steps.yaw_shift
     A[:, OFFSET_E, OFFSET_E] = A[:, OFFSET_N, OFFSET_N] = np.exp(-h / _MEMORY)
-    b = np.zeros((T, 11))
+    b = np.zeros((T, n))
     off = vh * (-0.5 * h * w - middle)
     b[:, E], b[:, N], b[:, AZIMUTH] = C * off, -S * off, -h * w
     d = s2[:3] * steps.weight2 + steps.extra
     d[still, 2] = 1e-8 * h[still]
     half = 0.5 * vh
     across = d[:, 1] + half**2 * d[:, 2]
-    Q = np.zeros((T, 11, 11))
+    Q = np.zeros((T, n, n))
     Q[:, E, E] = S * S * d[:, 0] + C * C * across
     Q[:, N, N] = C * C * d[:, 0] + S * S * across
     Q[:, E, N] = Q[:, N, E] = S * C * (d[:, 0] - across)
     Q[:, E, AZIMUTH] = Q[:, AZIMUTH, E] = C * half * d[:, 2]
     Q[:, N, AZIMUTH] = Q[:, AZIMUTH, N] = -S * half * d[:, 2]
     Q[:, AZIMUTH, AZIMUTH] = d[:, 2]
-    Q[:, OFFSET_E, OFFSET_E] = Q[:, OFFSET_N, OFFSET_N] = s2[3] * h
+    Q[:, OFFSET_E, OFFSET_E] = Q[:, OFFSET_N, OFFSET_N] = slow
     Q[:, SCALE, SCALE], Q[:, BIAS, BIAS] = _SCALE_WALK**2 * h, _BIAS_WALK**2 * h
-    A[0], b[0], Q[0] = np.eye(11), 0.0, 0.0
+    A[0], b[0], Q[0] = np.eye(n), 0.0, 0.0
     return A, b, Q, S, C
 
 
-def _output(azimuth: Floats, place: Floats) -> tuple[Floats, Floats]:
+def _output(azimuth: Floats, place: Floats, n: int) -> tuple[Floats, Floats]:
     """Return the outputs ``H z + d``: fix east and north, and the yaw rate of a standing car."""
-    S, C = np.sin(azimuth), np.cos(azimuth)
-    H = np.zeros((azimuth.size, 3, 11))
+    H, d = np.zeros((azimuth.size, 3, n)), np.zeros((azimuth.size, 3))
     H[:, 0, [E, OFFSET_E]] = H[:, 1, [N, OFFSET_N]] = H[:, 2, BIAS, None] = 1.0
-    H[:, 0, AHEAD], H[:, 0, LEFT], H[:, 0, AZIMUTH] = S, -C, place[0] * C + place[1] * S
-    H[:, 1, AHEAD], H[:, 1, LEFT], H[:, 1, AZIMUTH] = C, S, -place[0] * S + place[1] * C
-    d = np.zeros((azimuth.size, 3))
-    d[:, :2] = -H[:, :2, AZIMUTH] * azimuth[:, None]
+    if n > AHEAD:
+        S, C = np.sin(azimuth), np.cos(azimuth)
+        H[:, 0, AHEAD], H[:, 0, LEFT], H[:, 0, AZIMUTH] = S, -C, place[0] * C + place[1] * S
+        H[:, 1, AHEAD], H[:, 1, LEFT], H[:, 1, AZIMUTH] = C, S, -place[0] * S + place[1] * C
+        d[:, :2] = -H[:, :2, AZIMUTH] * azimuth[:, None]
     return H, d
 
 
-def _answer(
-    grid: Grid, x: Floats, P: Floats, clock: Floats, prior: Floats, azimuth: Floats, sigma: Floats, loglik: float
-) -> Piece:
-    mean = x[-1, UNKNOWN].copy()
-    mean[1:3] += clock
+def _answer(grid: Grid, x: Floats, P: Floats, clock: Floats, prior: Floats, sigma: Floats, loglik: float) -> Piece:
+    mean = np.zeros(5)
     free = prior > 1e-5
-    information = np.zeros((5, 5))
     at = np.array(UNKNOWN)[free]
+    mean[free] = x[-1, at]
+    mean[1:3] += clock
+    information = np.zeros((5, 5))
     inside = np.linalg.pinv(P[-1][np.ix_(at, at)]) - np.diag(prior[free] ** -2.0)
     # what the data say is never less than nothing
     values, vectors = np.linalg.eigh(0.5 * (inside + inside.T))
@@ -290,16 +304,18 @@ def _answer(
         grid.t,
         mean,
         information,
-        float(x[:, BIAS].mean()),
+        x[:, BIAS].copy(),
         float(np.sqrt(P[k, BIAS, BIAS])),
-        azimuth,
+        x[:, AZIMUTH].copy(),
         sigma,
         loglik,
         True,
     )
 
 
-def _learnt(grid: Grid, steps: _Steps, W: Floats, S: Floats, C: Floats, fixes: float, s2: Floats) -> Floats:
+def _learnt(
+    grid: Grid, steps: _Steps, W: Floats, S: Floats, C: Floats, fixes: float, wander: Floats, s2: Floats
+) -> Floats:
     """Return the squared scales: means of posterior squared residuals over squared weights."""
     half = 0.5 * steps.v * grid.h
     squares = np.empty((len(grid), 4))
@@ -309,7 +325,7 @@ def _learnt(grid: Grid, steps: _Steps, W: Floats, S: Floats, C: Floats, fixes: f
     squares[:, 1] = aside - 2 * half * turned + half**2 * W[:, AZIMUTH, AZIMUTH]
     squares[:, 2] = W[:, AZIMUTH, AZIMUTH]
     squares[:, :3] /= steps.weight2
-    squares[:, 3] = 0.5 * (W[:, OFFSET_E, OFFSET_E] + W[:, OFFSET_N, OFFSET_N]) / grid.h
+    squares[:, 3] = 0.5 * wander
     used = np.ones((len(grid), 4), dtype=bool)
     used[:, :3] = steps.extra == 0
     used[:, 2] &= steps.w == steps.w_raw
