@@ -2,15 +2,17 @@
 
 The log is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
 gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened by what
-hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate too are tested by
-hiding these as well, and bridged by constant velocity where hidden fixes show that to be better. A method that fails on
+hiding the log's own fixes shows (`calibrate`), or narrowed. Gaps in which the log lacks the speed or the yaw rate too are tested by
+hiding these as well, and bridged by constant velocity where hidden fixes show that to be better; where they speak, the
+chain whose fixes are wrong by white noise only competes in the same way. A method that fails on
 a piece is replaced by a simpler one there, and the track says so.
 
-Positions are those that the receiver would have reported. What it is wrong by for minutes at a time is in the fixes on
-both sides of a gap and in the filling between them, and hiding fixes cannot show it. The chain learns how large that
-slow error is (its fix offset), and the half-widths have it added:
+Positions are those that the receiver would have reported, and the half-widths say how far off they are: hidden fixes
+lie within them as often as `level` says, on this log. What the receiver is wrong by for minutes at a time is in the
+fixes on both sides of a gap and in the filling between them, and hiding fixes cannot show it; the chain learns how
+large that slow error is (its fix offset), and the messages name it.
 
-    half = z sqrt(inflation^2 (variance of the path + variance of a fix) + variance of the slow error)
+    half = z inflation sqrt(variance of the path + variance of a fix)
 """
 
 import os
