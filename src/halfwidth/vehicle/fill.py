@@ -467,7 +467,7 @@ def _estimated(
             mine.append(_Bridge(span, by, tuple(tests.get(by, [])), 0.0))
         for span in outer:
             # without a test of its own, an end is at least as uncertain as a model says
-            own_test = ends or tests.get(chosen.name, ())
+            own_test = ends or tests.get(chosen.name, [])
             mine.append(_Bridge(span, chosen.name, tuple(own_test), 0.0 if ends else 1.0))
         bridges += mine
         messages.extend(_choice_words(tests, mine))
