@@ -95,10 +95,10 @@ if TYPE_CHECKING:
     from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
     from halfwidth.methods.loss import Runnalls as Runnalls
     from halfwidth.methods.map import BatchLP as BatchLP
-    from halfwidth.methods.mixed import MixedFilter as MixedFilter
-    from halfwidth.methods.mixed_window import MixedWindow as MixedWindow
     from halfwidth.methods.memory import MemoryChoice as MemoryChoice
     from halfwidth.methods.memory import choose_memory as choose_memory
+    from halfwidth.methods.mixed import MixedFilter as MixedFilter
+    from halfwidth.methods.mixed_window import MixedWindow as MixedWindow
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
