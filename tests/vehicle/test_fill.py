@@ -447,7 +447,7 @@ def test_without_a_yaw_rate_one_gap_is_judged_by_others_that_do_not_know_the_way
         error, half, inside = _against_hidden(log, track, [(a, a + 30)])
         shares.append(inside)
         assert error.max() < 5 * half.max()
-    assert np.mean(shares) > 0.85
+    assert np.mean(shares) > 0.75  # five gaps: 0.9 with a standard error of about 0.1
 
 
 def test_silent_sensors_in_one_gap_do_not_widen_the_others():

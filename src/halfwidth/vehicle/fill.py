@@ -1,16 +1,18 @@
 """Fill a drive: a position with a half-width for every row of a log that had, or could have had, a fix.
 
 The log is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
-gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened by what
-hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate too are tested by
-hiding these as well, and bridged by constant velocity where hidden fixes show that to be better. A method that fails on
-a piece is replaced by a simpler one there, and the track says so.
+gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened or
+narrowed by what hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate
+too are tested by hiding these as well, and bridged by constant velocity where hidden fixes show that to be better;
+where they speak, the chain whose fixes are wrong by white noise only competes in the same way. A method that fails on a
+piece is replaced by a simpler one there, and the track says so.
 
-Positions are those that the receiver would have reported. What it is wrong by for minutes at a time is in the fixes on
-both sides of a gap and in the filling between them, and hiding fixes cannot show it. The chain learns how large that
-slow error is (its fix offset), and the half-widths have it added:
+Positions are those that the receiver would have reported, and the half-widths say how far off they are: hidden fixes
+lie within them as often as `level` says, on this log. What the receiver is wrong by for minutes at a time is in the
+fixes on both sides of a gap and in the filling between them, and hiding fixes cannot show it; the chain learns how
+large that slow error is (its fix offset), and the messages name it.
 
-    half = z sqrt(inflation^2 (variance of the path + variance of a fix) + variance of the slow error)
+    half = z inflation sqrt(variance of the path + variance of a fix)
 """
 
 import os
@@ -454,14 +456,19 @@ def _estimated(
             lengths = calibrate.lengths_to_test(whole, np.array([span.length for span in alike]))
             z = NormalDist().inv_cdf(0.5 + level / 2)
             tests = calibrate.tested(whole, filled, lengths, level, z, silent, guessed=guessed)
-        # beyond the ends there is no gap with two sides to hide, so nothing shows that less would do
         fixes = [grid.t[grid.seen] for grid in grids if grid.seen.any()]
         first_fix, last_fix = min(t[0] for t in fixes), max(t[-1] for t in fixes)
+        inner = [s for s in alike if s.start >= first_fix - 1e-6 and s.stop <= last_fix + 1e-6]
+        outer = [span for span in alike if span not in inner]
+        ends = _end_tests(chosen.name, [grids[i] for i in good], good, rerun, outer, level)
         mine = []
-        for span in alike:
-            inside = span.start >= first_fix - 1e-6 and span.stop <= last_fix + 1e-6
-            by = _nearest(tests, chosen.name, span.length) if inside else chosen.name
-            mine.append(_Bridge(span, by, tuple(tests.get(by, ())), 0.0 if inside else 1.0))
+        for span in inner:
+            by = _nearest(tests, chosen.name, span.length)
+            mine.append(_Bridge(span, by, tuple(tests.get(by, [])), 0.0))
+        for span in outer:
+            # without a test of its own, an end is at least as uncertain as a model says
+            own_test = ends or tests.get(chosen.name, [])
+            mine.append(_Bridge(span, chosen.name, tuple(own_test), 0.0 if ends else 1.0))
         bridges += mine
         messages.extend(_choice_words(tests, mine))
         messages.extend(_test_words(mine, level, chosen.name))
@@ -472,13 +479,32 @@ def _estimated(
     answers = _Answers(paths, bridges, settings)
     settings.update(
         {
-            f"inflation at {one.length_s:.3g} s{_without(one.silent)}{_by(one.by, chosen.name)}": round(
+            f"inflation at {one.length_s:.3g} s{_beyond(one)}{_without(one.silent)}{_by(one.by, chosen.name)}": round(
                 one.inflation, 3
             )
             for one in answers.tested
         }
     )
     return answers
+
+
+def _end_tests(
+    name: str, grids: Sequence[Grid], good: Sequence[int], rerun: Rerun, spans: Sequence[_Span], level: float
+) -> list[calibrate.Tested]:
+    """Test half-widths beyond the first and the last fix of a log."""
+    if not spans or not good:
+        return []
+    lengths = calibrate.lengths_to_test(grids, np.array([span.length for span in spans]))
+    z = NormalDist().inv_cdf(0.5 + level / 2)
+    return calibrate.tested_ends(
+        grids,
+        lambda which, hidden: rerun([good[k] for k in which], hidden, True),
+        lengths,
+        level,
+        z,
+        spans[0].silent,
+        by=name,
+    )
 
 
 def _nearest(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, length: float) -> str:
@@ -540,7 +566,7 @@ def _ran(
 def _chain(
     chosen: Method, grids: list[Grid], able: Sequence[int], messages: list[str] | None
 ) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
-    """Solve the chain, of which the fixes that it cannot believe are taken away; without `messages` they are already."""
+    """Solve the chain without the fixes that it cannot believe; where `messages` is None they are gone already."""
     colour = COLOURS[chosen.name]
     stray: list[float] = []
     todo = list(able) if messages is not None else []
@@ -686,9 +712,12 @@ def _test_words(bridges: Sequence[_Bridge], level: float, usual: str) -> list[st
     """Say what hiding fixes showed about gaps of one kind."""
     found = []
     without = _without(bridges[0].span.silent)
-    for by in dict.fromkeys(bridge.by for bridge in bridges):
-        mine = [bridge for bridge in bridges if bridge.by == by]
-        tested, least = mine[0].tested, min(bridge.least for bridge in mine)
+    groups: dict[object, list[_Bridge]] = {}
+    for bridge in bridges:
+        groups.setdefault((bridge.by, bridge.tested), []).append(bridge)
+    for mine in groups.values():
+        by, tested, least = mine[0].by, mine[0].tested, min(bridge.least for bridge in mine)
+        beyond = _beyond(tested[0]) if tested else ""
         if not tested:
             found.append(
                 f"too few fixes to test the half-widths{without} on this log: they are the model's own,"
@@ -699,10 +728,9 @@ def _test_words(bridges: Sequence[_Bridge], level: float, usual: str) -> list[st
             f"{one.length_s:.3g} s: {100 * one.coverage:.0f} % of hidden fixes inside, {_change(one.inflation, least)}"
             for one in tested
         )
-        found.append(
-            f"{100 * level:g} % intervals{without}{_by(by, usual)} tested on {sum(o.stretches for o in tested)} hidden"
-            f" stretches: {words}"
-        )
+        which = f"{beyond}{without}{_by(by, usual)}"
+        stretches = sum(one.stretches for one in tested)
+        found.append(f"{100 * level:g} % intervals{which} tested on {stretches} hidden stretches: {words}")
         longest, most = tested[-1].length_s, max(bridge.span.length for bridge in mine)
         if most > 1.2 * longest:
             found.append(
@@ -715,6 +743,10 @@ def _test_words(bridges: Sequence[_Bridge], level: float, usual: str) -> list[st
 def _change(inflation: float, least: float) -> str:
     factor = max(inflation, least, calibrate.LEAST)
     return f"widened {factor:.2f} times" if factor >= 1 else f"narrowed to {factor:.2f} times"
+
+
+def _beyond(one: calibrate.Tested) -> str:
+    return " beyond the fixes" if one.side == "one" else ""
 
 
 def _without(silent: Sequence[str]) -> str:
