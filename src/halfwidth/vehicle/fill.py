@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle import calibrate, chain
+from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, usable
 from halfwidth.vehicle.estimators import method as method_of
@@ -31,6 +32,7 @@ from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path
+from halfwidth.vehicle.stray import strays
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
 
 Floats = NDArray[np.float64]
@@ -79,8 +81,8 @@ def fill(
     level : float
         Probability of the half-widths, between 0 and 1.
     clock_offset : float, optional
-        Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; 0 if
-        absent.
+        Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; found from
+        the log, for each by itself, if absent.
     distrust : bool
         Whether fixes that only repeat the one before while the car moves are found and bridged; the track's messages
         name them.
@@ -110,12 +112,16 @@ def fill(
         messages.extend(doubtful.words(drive_log))
         drive_log = doubtful.masked(drive_log)
     drive_log = _with_pauses_filled(drive_log, messages)
-    grid = sampled(drive_log, clock_offset=offset)
+    sensors = calibrated(drive_log, clock_offset=None if clock_offset is None else offset)
+    messages.extend(sensors.words())
+    grid = sampled(drive_log, sensors=sensors)
     chosen = _chosen(grid, asked, messages)
-    if clock_offset is None and chosen.name not in ("linear", "cv"):
-        messages.append("the clocks of fixes and sensors were taken to agree")
     wanted, quality = _wanted(drive_log)
     t = drive_log.t[wanted]
+    if distrust:
+        stray = strays(grid, sensors)
+        messages.extend(filter(None, [stray.words(grid)]))
+        grid = stray.masked(grid)
     pieces = _pieces(grid, drive_log)
     spans = _spans(drive_log, grid, chosen, t, quality)
     free = asked is None or asked.name != chosen.name
@@ -124,9 +130,10 @@ def fill(
     away = _distance_in_time(drive_log, t)
     z = NormalDist().inv_cdf(0.5 + level / 2)
     half = _half_widths(columns, answers, grid, away, z, t, quality)
-    lat, lon = grid.frame.to_geodetic(columns.east, columns.north)
+    arm_east, arm_north = sensors.arm(t)
+    lat, lon = grid.frame.to_geodetic(columns.east + arm_east, columns.north + arm_north)
     gaps = gaps_of(t, lat, lon, half.max(axis=1), quality)
-    settings: dict[str, object] = {"clock_offset": offset, "context": CONTEXT}
+    settings: dict[str, object] = {"context": CONTEXT, "sensors": sensors.to_dict()}
     settings.update(answers.settings)
     return Track(
         t_s=t,
