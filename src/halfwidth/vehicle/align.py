@@ -319,7 +319,7 @@ def _joined(known: Calibration, pieces: Sequence[reckoning.Piece], there: Sequen
         bias_sd=float(weight.sum() ** -0.5) if yaw_known else float("inf"),
         bias_at=tuple(zip(middle, bias.tolist(), strict=True)) if yaw_known and len(pieces) > 1 else (),
         slip=float(np.median([piece.sigma[1] for piece in pieces])),
-        noise=tuple(np.median([piece.sigma for piece in pieces], axis=0).tolist()),
+        noise=dict(zip(reckoning.GROUPS, np.median([piece.sigma for piece in pieces], axis=0).tolist(), strict=True)),
     )
 
 

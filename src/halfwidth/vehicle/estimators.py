@@ -35,6 +35,7 @@ from halfwidth.vehicle import chain, models
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
+from halfwidth.vehicle.pointing import azimuth_of
 
 Floats = NDArray[np.float64]
 Tuned = Mapping[str, float]
@@ -157,7 +158,7 @@ def _pace(drive: Grid) -> float:
 
 def _acceleration(drive: Grid) -> Floats:
     """Return the acceleration (T, 2) over each step, in local axes, from speed and azimuth."""
-    azimuth, v, h = chain.azimuth_of(drive), drive.speed, drive.h
+    azimuth, v, h = azimuth_of(drive), drive.speed, drive.h
     at_node = 0.5 * (v + np.concatenate((v[1:], v[-1:])))
     velocity = at_node[:, None] * np.column_stack((np.sin(azimuth), np.cos(azimuth)))
     pushed: Floats = np.diff(velocity, axis=0, prepend=velocity[:1]) / h[:, None]
@@ -292,7 +293,7 @@ def _turning(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
     paths = []
     for drive in drives:
         case = _ctrv_case(drive)
-        model = _ctrv(drive, case, {**tuned, "azimuth": float(chain.azimuth_of(drive)[0])})
+        model = _ctrv(drive, case, {**tuned, "azimuth": float(azimuth_of(drive)[0])})
         est = estimate(model, case.record, load("ExtendedKalman")(smooth=True))
         paths.append(_path(drive, case, est, est.x[:, 2], est.x[:, 3], tuned))
     return paths
@@ -300,7 +301,7 @@ def _turning(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
 
 def _tuned_ctrv(drive: Grid) -> Tuned:
     names, case = list(_CTRV_START), _ctrv_case(drive)
-    azimuth = float(chain.azimuth_of(drive)[0])
+    azimuth = float(azimuth_of(drive)[0])
 
     def loglik(log_scales: Floats) -> float:
         scales = dict(zip(names, (float(v) for v in np.exp(log_scales)), strict=True))
@@ -323,7 +324,7 @@ def _programme(build: Callable[[Grid], tuple[Linear, Floats]], **settings: Any) 
             model, u = build(drive)
             case = _case(drive, u)
             est = estimate(model, case.record, load("BatchLP")(**settings))
-            paths.append(_path(drive, case, est, chain.azimuth_of(drive), drive.speed, tuned))
+            paths.append(_path(drive, case, est, azimuth_of(drive), drive.speed, tuned))
         return paths
 
     return run
@@ -334,7 +335,7 @@ def _ins(drive: Grid) -> tuple[Linear, Floats]:
 
 
 def _two_antenna(drive: Grid) -> tuple[Linear, Floats]:
-    moved = models.displacement(chain.azimuth_of(drive), drive.speed, drive.h)
+    moved = models.displacement(azimuth_of(drive), drive.speed, drive.h)
     return models.two_antenna_linear(antennas=1), moved
 
 

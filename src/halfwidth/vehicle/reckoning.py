@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth import _core
-from halfwidth.vehicle import chain
 from halfwidth.vehicle.grid import DRIFT, Grid, means, silence
+from halfwidth.vehicle.pointing import azimuth_of
 
 Floats = NDArray[np.float64]
 
@@ -32,10 +32,13 @@ E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS, SPEED_CLOCK, YAW_CLOCK, AHEAD, L
 #: The unknowns of the sensors, in the order of `Piece.mean`.
 UNKNOWN = (SCALE, SPEED_CLOCK, YAW_CLOCK, AHEAD, LEFT)
 
+#: Names of the learnt scales, as in `chain`.
+GROUPS = ("longitudinal", "lateral", "yaw", "offset", "fix")
+
 #: Prior standard deviations of speed scale, clocks (s) and antenna (m), and of the bias (rad/s).
 PRIOR, BIAS_SD = np.array([0.05, 0.5, 0.5, 1.0, 1.0]), 0.02
 
-#: Where learning starts, floor and ceiling of the five scales of `chain`.
+#: Where learning starts, floor and ceiling of the five scales.
 _START = np.array([0.1, 0.05, 0.01, 0.3, 0.3])
 _FLOOR = np.array([1e-3, 1e-4, 1e-5, 1e-4, 3e-3])
 _CEILING = np.array([30.0, 3.0, 3.0, 30.0, 1e3])
@@ -75,7 +78,7 @@ class Piece:
     azimuth : (T,) array
         rad.
     sigma : (5,) array
-        The learnt scales, in the order of `chain.GROUPS`.
+        The learnt scales, in the order of `GROUPS`.
     loglik : float
     sound : bool
         Whether the numbers can be used.
@@ -145,7 +148,7 @@ def solve(
     for k in range(rounds):
         steps = _steps(grid, streams, clock, still)
         if azimuth is None:
-            azimuth = chain.azimuth_of(replace(grid, speed=steps.v, yaw_rate=steps.w))
+            azimuth = azimuth_of(replace(grid, speed=steps.v, yaw_rate=steps.w))
         A, b, Q, S, C = _motion(grid, steps, azimuth, s2, s2[3] * grid.h / slow_weight, still, n)
         H, d = _output(azimuth, place, n)
         y[:, 2] = steps.w_raw

@@ -98,9 +98,9 @@ class Calibration:
     slip : float
         How far the car moves sideways, as learnt: standard deviation of the sideways speed over a second, as a share
         of the forward speed.
-    noise : tuple of float
-        The scales of the chain as learnt from the drive, without stray fixes, in the order of `chain.GROUPS`; empty
-        where nothing could be learnt.
+    noise : mapping of str to float
+        Scales of the chain's residuals as learnt from the drive, stray fixes apart; empty where nothing could be
+        learnt.
     path : (n, 2) array
         Time, s, and azimuth, rad, along the drive, where the antenna is observable.
     messages : tuple of str
@@ -123,7 +123,7 @@ class Calibration:
     still: Floats = field(default_factory=lambda: np.empty((0, 2)), repr=False)
     still_bias: float = float("nan")
     slip: float = float("nan")
-    noise: tuple[float, ...] = ()
+    noise: Mapping[str, float] = field(default_factory=dict, repr=False)
     path: Floats = field(default_factory=lambda: np.empty((0, 2)), repr=False)
     messages: tuple[str, ...] = ()
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from halfwidth.vehicle import chain
 from halfwidth.vehicle.grid import Grid
+from halfwidth.vehicle.pointing import azimuth_of
 from halfwidth.vehicle.sensors import Calibration
 
 Floats = NDArray[np.float64]
@@ -39,6 +40,16 @@ JUMP, JUMP_M = 8.0, 1.0
 
 #: Doubts that are looked into at most, in one drive; how often, as what fades is seen bit by bit; rounds of the chain.
 _MOST, _LOOKS, _ROUNDS = 150, 3, 5
+
+#: Places where nobody doubts that show what is usual: about so many, and at least; the quantile of how far they are off
+#: that counts, and how many times that a stray fix is off; how many times `FAR` where there are too few such places.
+_CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 2.0, 2.0
+
+#: Scale of what the calibration takes to be without noise.
+_NO_NOISE = 1e-4
+
+#: Share of that distance that must be left when both sides of a gap are asked.
+_BOTH = 0.5
 
 #: Scale and bias are known to this many of their standard deviations, and no better than this.
 _KNOWN, _SCALE, _BIAS = 3.0, 0.003, 0.001
@@ -109,20 +120,21 @@ def strays(grid: Grid, sensors: Calibration) -> Strays:
         return _NONE
     settings = chain.Chain(
         rounds=_ROUNDS,
+        drifting=False,
         scale_sd=float(np.clip(_KNOWN * sensors.scale_sd, _SCALE, 0.03)),
         bias_sd=float(np.clip(_KNOWN * sensors.bias_sd, _BIAS, 0.01)),
     )
-    found = _Found(np.zeros(len(grid)), np.zeros(len(grid), dtype=bool))
-    seen = np.flatnonzero(grid.seen)
-    gaps, jumps = _gaps(grid, seen), _jumps(grid, seen)
+    noise = np.array([sensors.noise.get(name, _NO_NOISE) for name in chain.GROUPS])
+    search = _Search(grid, np.flatnonzero(grid.seen), settings, noise)
+    gaps, jumps = _gaps(grid, search.seen), _jumps(grid, search.seen)
     doubts = gaps[:_MOST]
     for _ in range(_LOOKS):
-        doubts = found.look(grid, seen, doubts, settings, sensors)
+        doubts = search.look(doubts)
     # what a stray stretch begins or ends with is a jump, too
-    near = np.convolve(found.gone[seen], np.ones(3), mode="same") > 0
-    found.look(grid, seen, [doubt for doubt in jumps if not near[doubt.first]][:_MOST], settings, sensors)
-    at = np.flatnonzero(found.gone)
-    return Strays(at, found.off[at]) if at.size <= 0.3 * seen.size else _NONE
+    near = np.convolve(search.gone[search.seen], np.ones(3), mode="same") > 0
+    search.look([doubt for doubt in jumps if not near[doubt.first]][:_MOST])
+    at = np.flatnonzero(search.gone)
+    return Strays(at, search.size[at]) if at.size <= 0.3 * search.seen.size else _NONE
 
 
 @dataclass(frozen=True)
@@ -142,25 +154,62 @@ class _Doubt:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """What was found so far, written while looking."""
+class _Answer:
+    """What was said about one doubt at one length."""
 
-    off: Floats  # (T,)
-    gone: Mask  # (T,)
+    doubt: _Doubt
+    length: float
+    nodes: NDArray[np.intp]  # of the doubtful fixes
+    off: list[tuple[Floats, Floats]]  # how far they are off, and the standard deviation of that, for each side asked
 
-    def look(
-        self,
-        grid: Grid,
-        seen: NDArray[np.intp],
-        doubts: Sequence[_Doubt],
-        settings: chain.Chain,
-        sensors: Calibration,
-    ) -> list[_Doubt]:
-        """Ask the fixes before, or after, or both, where the doubtful ones should have been; return what is left."""
-        t = grid.t[seen]
-        asked, hidden = [], []
+
+@dataclass(frozen=True, eq=False)
+class _Wrong:
+    """Fixes that are wrong by what was said about one doubt."""
+
+    clear: float  # how many standard deviations the furthest is off
+    nodes: NDArray[np.intp]
+    distance: Floats
+
+
+class _Search:
+    """One drive, and what was found in it so far."""
+
+    def __init__(self, grid: Grid, seen: NDArray[np.intp], settings: chain.Chain, noise: Floats) -> None:
+        self.grid, self.seen, self.settings, self.noise = grid, seen, settings, noise
+        self.size = np.zeros(len(grid))
+        self.gone = np.zeros(len(grid), dtype=bool)
+        self._usual: dict[tuple[bool, bool, float], float] = {}
+
+    def look(self, doubts: Sequence[_Doubt]) -> list[_Doubt]:
+        """Find which of the doubtful fixes are wrong; return the doubts that had some, moved on to the next fix."""
+        clearest: dict[_Doubt, _Wrong] = {}
+        for answer in self._ask(doubts, DOUBTED):
+            doubt, nodes = answer.doubt, answer.nodes
+            if not _wrong(answer, 1.0).any():
+                continue
+            wrong = _wrong(answer, self._unusual(doubt, answer.length)) & ~self.gone[nodes]
+            if wrong.any():
+                distance, sd = answer.off[-1]
+                clear = float((distance / sd)[wrong].max())
+                if doubt not in clearest or clear > clearest[doubt].clear:
+                    clearest[doubt] = _Wrong(clear, nodes[wrong], distance[wrong])
+        left = []
+        for doubt, stray in self._confirmed(clearest).items():
+            self.size[stray.nodes], self.gone[stray.nodes] = stray.distance, True
+            rest = np.flatnonzero(~self.gone[self.seen[doubt.block[0] : doubt.block[1]]]) + doubt.block[0]
+            rest = rest[rest <= doubt.first] if doubt.backwards else rest[rest >= doubt.first]
+            if rest.size:
+                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0])))
+        return left
+
+    def _ask(self, doubts: Sequence[_Doubt], lengths: Sequence[float]) -> list[_Answer]:
+        """Ask the fixes before, or after, or both, where the doubtful ones should have been."""
+        t, seen = self.grid.t[self.seen], self.seen
+        asked: list[tuple[_Doubt, float, NDArray[np.intp], list[slice]]] = []
+        hidden = []
         for doubt in doubts:
-            for length in DOUBTED:
+            for length in lengths:
                 lo, hi = np.searchsorted(t, t[doubt.first] + np.array([-length, length]) * (1 + 1e-9)).tolist()
                 lo = max(lo, doubt.block[0]) if doubt.backwards else doubt.first
                 hi = doubt.first + 1 if doubt.backwards else min(hi, doubt.block[1])
@@ -171,29 +220,64 @@ class _Found:
                     break
                 sides = [(start, hi)] * doubt.before + [(lo, stop)] * doubt.after
                 parts = [slice(int(seen[a]), int(seen[b - 1]) + 1) for a, b in sides]
-                nodes = seen[lo:hi]
                 mask = self.gone.copy()
-                mask[nodes] = True
-                asked.append((doubt, nodes, parts))
-                hidden += [grid.rows(part).masked(mask[part]) for part in parts]
-        fits = iter(chain.solve(hidden, settings, sigma=np.array(sensors.noise), learn=False) if hidden else [])
-        clearest: dict[_Doubt, tuple[float, NDArray[np.intp], Floats]] = {}
-        for doubt, nodes, parts in asked:
-            off = [_off(grid, nodes, part, next(fits)) for part in parts]
-            wrong = _wrong(off, backwards=doubt.backwards) & ~self.gone[nodes]
-            if wrong.any():
-                distance, sd = off[-1]
-                clear = float((distance / sd)[wrong].max())
-                if clear > clearest.get(doubt, (0.0,))[0]:
-                    clearest[doubt] = clear, nodes[wrong], distance[wrong]
-        left = []
-        for doubt, (_, nodes, distance) in clearest.items():
-            self.off[nodes], self.gone[nodes] = distance, True
-            rest = np.flatnonzero(~self.gone[seen[doubt.block[0] : doubt.block[1]]]) + doubt.block[0]
-            rest = rest[rest <= doubt.first] if doubt.backwards else rest[rest >= doubt.first]
-            if rest.size:
-                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0])))
-        return left
+                mask[seen[lo:hi]] = True
+                asked.append((doubt, length, seen[lo:hi], parts))
+                hidden += [self.grid.rows(part).masked(mask[part]) for part in parts]
+        if not hidden:
+            return []
+        fits = iter(chain.solve(hidden, self.settings, sigma=self.noise, learn=False))
+        return [
+            _Answer(doubt, length, nodes, [_off(self.grid, nodes, part, next(fits)) for part in parts])
+            for doubt, length, nodes, parts in asked
+        ]
+
+    def _confirmed(self, found: dict[_Doubt, "_Wrong"]) -> dict[_Doubt, "_Wrong"]:
+        """Ask the other side of the gap, too: what it puts right is not wrong."""
+        t, end = self.grid.t[self.seen], self.seen.size
+        hidden, parts = [], []
+        for doubt, wrong in found.items():
+            mask = self.gone.copy()
+            mask[wrong.nodes] = True
+            here = t[doubt.first]
+            back, ahead = (AROUND, AROUND + DOUBTED[-1]) if doubt.after else (AROUND + DOUBTED[-1], AROUND)
+            start = np.searchsorted(t, min(here, t[max(doubt.block[0] - 1, 0)]) - back)
+            stop = np.searchsorted(t, max(here, t[min(doubt.block[1], end - 1)] if not doubt.after else here) + ahead)
+            parts.append(slice(int(self.seen[start]), int(self.seen[min(int(stop), end - 1)]) + 1))
+            hidden.append(self.grid.rows(parts[-1]).masked(mask[parts[-1]]))
+        fits = chain.solve(hidden, self.settings, sigma=self.noise, learn=False) if hidden else []
+        kept = {}
+        for (doubt, wrong), part, fit in zip(found.items(), parts, fits, strict=True):
+            both, _ = _off(self.grid, wrong.nodes, part, fit)
+            if float(np.median(both)) > _BOTH * float(np.median(wrong.distance)):
+                kept[doubt] = wrong
+        return kept
+
+    def _unusual(self, doubt: _Doubt, length: float) -> float:
+        """Return how many times further off than `FAR` fixes must be that are doubted like this.
+
+        The chain's own deviations are too small on a log whose errors are not as it takes them. How far fixes are off
+        that nobody doubts, all along the drive, says by how much.
+        """
+        kind = doubt.before, doubt.after, length
+        if kind not in self._usual:
+            room = length + AROUND / 2
+            t = self.grid.t[self.seen]
+            controls = []
+            for a, b in _blocks(self.grid, self.seen):
+                times = np.arange(t[a] + room, t[b - 1] - room, max(length, (t[-1] - t[0]) / _CONTROLS))
+                firsts = np.searchsorted(t, times)
+                controls += [
+                    replace(doubt, first=int(k), most=np.inf, block=(a, b))
+                    for k in firsts
+                    if not self.gone[self.seen[k]]
+                ]
+            answers = self._ask(controls, (length,))
+            most = [float(np.min([distance / sd for distance, sd in one.off], axis=0).max()) for one in answers]
+            enough = len(most) >= _FEWEST_CONTROLS
+            usual = float(np.quantile(most, _QUANTILE)) if enough else _UNKNOWN * FAR
+            self._usual[kind] = max(1.0, _MARGIN * usual / FAR if enough else _UNKNOWN)
+        return self._usual[kind]
 
 
 def _off(grid: Grid, nodes: NDArray[np.intp], part: slice, fit: chain.Fit) -> tuple[Floats, Floats]:
@@ -227,7 +311,7 @@ def _blocks(grid: Grid, seen: NDArray[np.intp]) -> list[tuple[int, int]]:
 
 def _jumps(grid: Grid, seen: NDArray[np.intp]) -> list[_Doubt]:
     """Return the doubts about what follows a step between fixes that the sensors did not see."""
-    azimuth = chain.azimuth_of(grid)
+    azimuth = azimuth_of(grid)
     middle = 0.5 * (azimuth + np.concatenate((azimuth[:1], azimuth[:-1])))
     way = grid.speed * grid.h
     moved = np.column_stack((np.cumsum(way * np.sin(middle)), np.cumsum(way * np.cos(middle))))[seen]
@@ -245,15 +329,15 @@ def _jumps(grid: Grid, seen: NDArray[np.intp]) -> list[_Doubt]:
     return found
 
 
-def _wrong(off: Sequence[tuple[Floats, Floats]], *, backwards: bool) -> Mask:
+def _wrong(answer: _Answer, times: float) -> Mask:
     """Return which of the doubted fixes are wrong: from the first on, up to where they agree again.
 
-    They are wrong if all that were asked say so; the last one asked says where they agree.
+    They are wrong if all that were asked say so, by so many times the usual; the last one asked says where they agree.
     """
-    far = np.all([(distance > FAR * sd) & (distance > FAR_M) for distance, sd in off], axis=0)
-    distance, sd = off[-1]
-    near = distance < np.maximum(NEAR * sd, FAR_M)
-    if backwards:
+    far = np.all([(distance > times * FAR * sd) & (distance > FAR_M) for distance, sd in answer.off], axis=0)
+    distance, sd = answer.off[-1]
+    near = distance < np.maximum(times * NEAR * sd, FAR_M)
+    if answer.doubt.backwards:
         far, near = far[::-1], near[::-1]
     wrong = np.zeros(far.size, dtype=bool)
     if far.any():
@@ -263,4 +347,4 @@ def _wrong(off: Sequence[tuple[Floats, Floats]], *, backwards: bool) -> Mask:
         # where they do not agree again for a while, or most before that do, it is no fault that came and went
         if agreed.size >= max(1, AGREED * far.size) and agreed.mean() > 0.8 and (~near[:again]).mean() > 0.5:
             wrong[:again] = ~near[:again] | far[:again]
-    return wrong[::-1] if backwards else wrong
+    return wrong[::-1] if answer.doubt.backwards else wrong
