@@ -8,7 +8,13 @@ longer linear in what is sought. It is linearised about the newest estimate,
 which makes the problem the linear program of known matrices with a few dense columns for theta. Its solution is the
 next point; a step that does not lower the true objective ``sum c_j max|rho_j|`` is shortened. Bounds of theta hold
 throughout. A parameter may **drift**: it is then a straight line over the record, whose end is reported and whose total
-change is bounded.
+change is bounded. Where half-widths are known or capped the program about a poor point may have no solution although
+the problem has: the rows are then given slack, whose total is brought to nothing first.
+
+The **logarithmic** objective ``sum_j N_j ln s_j`` is the joint density itself, of which the others are linearisations:
+with T rows of states and K seen rows of outputs it is T times ``sum ln q_i + (K / T) sum ln r_j``. Its tangent lies
+above it, so that the linear program with costs ``N_j / s_j`` lowers it. It has no minimum at 0, hence every unknown
+half-width needs a floor: what the sensor's step or its data sheet says.
 
 ``Window(SequentialLP(rounds=1), memory)`` is the on-line LSU estimator of the paper: one linear program a row, about
 the last window's estimate.
@@ -16,30 +22,38 @@ the last window's estimate.
 References
 ----------
 Pavelková and Kárný (2013), eqs. (11), (12), (24)-(26), appendix A.2; the sign of the block that F's entries enter with
-is corrected (the coefficient of ``F[k, j]`` in row k is ``-y[j]``).
+is corrected (the coefficient of ``F[k, j]`` in row k is ``-y[j]``). Pavelková's slides on GPS and CAN data: the
+logarithmic objective.
 """
 
 import dataclasses
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from halfwidth.array import Array
-from halfwidth.errors import BadValue
+from halfwidth.array import Array, real
+from halfwidth.errors import BadShape, BadValue
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._residuals import reference, residuals
-from halfwidth.model import Entry, Linear, Model, Nonlinear, needs_a_box
+from halfwidth.model import Entry, Linear, Model, Nonlinear, arity, needs_a_box
 from halfwidth.noise import Gaussian, Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.solvers.banded import Answer, Chain, chain_of, solve
+from halfwidth.solvers.banded import Answer, Chain, chain_of, solve, squares
 from halfwidth.spread import Box, Normal
+from halfwidth.trace import Tape, Untraceable, compiled
 
 #: Shares of a step that are tried, the whole one first.
 _STEPS = (1.0, 0.5, 0.25, 0.1, 0.03)
+#: Times that slack is used to find a point which fits the caps.
+_RESTORATIONS = 3
 #: Rounds in which the scale of each group is found for a nonlinear model.
 _SCALINGS = 3
+#: Total excess of rows over their caps, in units of the caps, that counts as none.
+_NONE = 1e-6
+#: A half-width within this factor of its floor sits on it.
+_ON_FLOOR = 1.0 + 1e-3
 #: A scale stays above this share of the cap (or of the first residuals): a smooth fit must not make one vanish.
 _LEAST = 0.03
 
@@ -50,18 +64,24 @@ class SequentialLP:
 
     Parameters
     ----------
-    objective : {"scaled", "paper"}
-        ``sum N_j s_j / sigma_j`` with the noise level sigma_j of a least-squares fit, or the paper's ``sum s_j``.
-    point : {"central", "optimal"}
-        Central points follow the central path to a relative gap of 0.3; they estimate better than optimal ones.
+    objective : {"scaled", "paper", "log"}
+        ``sum N_j s_j / sigma_j`` with the noise level sigma_j of a least-squares fit, the paper's ``sum s_j``, or
+        ``sum N_j ln s_j``, which starts at the scaled optimum and needs ``at_least`` above 0 for every unknown
+        half-width; ``info["on_floor"]`` names those that end there.
+    point : {"central", "least_squares", "optimal"}
+        Central points follow the central path to a relative gap of 0.3; they estimate better than optimal ones. For
+        the logarithm the path is that of the program at its optimum. Least squares is taken inside the optimal
+        half-widths, each row in units of its own.
     rounds : int
-        Most linearisations.
+        Most linearisations of each objective.
     tol : float
-        Relative decrease of the objective below which to stop.
+        Relative decrease of the objective below which to stop; of the logarithm, of the half-widths' mean.
     drift : float or None
         Largest change of each theta over the record; None keeps it constant.
     theta : tuple of float or None
         Where to start; 0 moved into the bounds if absent.
+    start : (T + 1, nx) array_like or None
+        Trajectory to start from; of least squares, or of an extended Kalman smoother, if absent.
 
     Raises
     ------
@@ -78,15 +98,19 @@ class SequentialLP:
     array([0.9])
     """
 
-    objective: Literal["scaled", "paper"] = "scaled"
-    point: Literal["central", "optimal"] = "central"
+    objective: Literal["scaled", "paper", "log"] = "scaled"
+    point: Literal["central", "least_squares", "optimal"] = "central"
     rounds: int = 30
     tol: float = 1e-4
     drift: float | None = None
     theta: tuple[float, ...] | None = None
+    start: Any = dataclasses.field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name, allowed in (("objective", ("scaled", "paper")), ("point", ("central", "optimal"))):
+        for name, allowed in (
+            ("objective", ("scaled", "paper", "log")),
+            ("point", ("central", "least_squares", "optimal")),
+        ):
             if getattr(self, name) not in allowed:
                 raise BadValue(f"`{name}` is {getattr(self, name)!r}, one of {', '.join(allowed)} was expected")
         if self.rounds < 1:
@@ -116,6 +140,12 @@ class SequentialLP:
             moving = [name for name in unknown if not model.matrices[name].constant]
             if moving:
                 return f"`SequentialLP` needs constant matrices where entries are unknown but `{moving[0]}` moves"
+        floor, cap = half_width_bounds(model)
+        if self.objective == "log" and np.any((floor < cap) & (floor <= 0)):
+            return (
+                "`SequentialLP(objective='log')` needs a floor above 0 for every unknown half-width: the logarithm has"
+                " no minimum at 0\nhint: Uniform.unknown(at_least=..., at_most=...)"
+            )
         if self.theta is not None and len(self.theta) != len(getattr(model, "theta_entries", ())):
             return f"`theta` has {len(self.theta)} entries, the model has {len(getattr(model, 'theta_entries', ()))}"
         return None
@@ -124,32 +154,162 @@ class SequentialLP:
         """Estimate states, half-widths and theta of one record."""
         rows = rows_of(model, record, self.drift)
         theta = start_theta(rows, self.theta)
-        x = rows.start(theta)
-        c = np.ones(rows.groups) if self.objective == "paper" else rows.weights(x, theta)
-        best = rows.worth(x, theta, c)
-        status, answer = Status.STALLED, None
-        history = [best]
+        x = rows.start(theta) if self.start is None else _given(self.start, len(record), rows.nx)
+        at = _At(x, theta, None, Status.STALLED, [], np.ones(rows.groups))
+        log = self.objective == "log"
+        # the logarithm is concave: where it ends depends on where it starts
+        if self.objective != "paper":
+            at = at._replace(c=rows.weights(x, theta))
+        at = self._descended(rows, at, "optimal" if log or self.point == "least_squares" else self.point)
+        if log and at.status.good:
+            at = self._descended(rows, at, "optimal", log=True)
+        if at.status.good and self.point == "least_squares":
+            at = _squared(rows, at)
+        elif at.status.good and log and self.point == "central":
+            at = _centred(rows, at)
+        return finished(self, model, record, rows, at)
+
+    def _descended(self, rows: "Rows", at: "_At", point: Any, *, log: bool = False) -> "_At":
+        """Lower one objective, program by program, about the newest point."""
+        x, theta, answer, status, history, c = at
+
+        def worth(x: Array, theta: Array) -> float:
+            return rows.log_worth(x, theta) if log else rows.worth(x, theta, c)
+
+        best = worth(x, theta)
+        history = [*history, best]
+        first, restored = not log, 0
         for _ in range(self.rounds):
-            answer = solve(rows.chain(x, theta, c), point=self.point)
+            if log:
+                c = rows.tangent(x, theta)
+            answer = solve(rows.chain(x, theta, c), point=point)
             status = answer.status
+            if status is Status.INFEASIBLE and restored < _RESTORATIONS:
+                restored += 1
+                x, theta, fits = _restored(rows, x, theta, self.rounds)
+                if fits:
+                    best, first = worth(x, theta), True
+                    history.append(best)
+                    status = Status.REDUCED  # it fits as it is, should there be no rounds left to better it
+                    continue
             if not status.good:
                 break
             for share in _STEPS:
                 x_new, theta_new = x + share * (answer.x - x), theta + share * (answer.theta - theta)
-                value = rows.worth(x_new, theta_new, c)
+                value = worth(x_new, theta_new)
                 # The first point comes from least squares, which a central point need not beat.
-                if value < best or (len(history) == 1 and value < 2.0 * best):
+                if value < best or (first and value < 2.0 * best):
                     break
             else:
                 break
             x, theta, gain, best = x_new, theta_new, best - value, value
             history.append(value)
-            if abs(gain) <= self.tol * max(abs(value), 1e-300) and len(history) > 2:
+            if abs(gain) <= self.tol * (1.0 if log else max(abs(value), 1e-300)) and not first:
                 break
-        return finished(self, model, record, rows, x, theta, c, status, answer, history)
+            first = False
+        return _At(x, theta, answer, status, history, c)
 
 
-class LinearRows:
+class _At(NamedTuple):
+    """Where a descent stands: states, theta, the last program's answer, how it went, the objective's course, costs."""
+
+    x: Array
+    theta: Array
+    answer: Answer | None
+    status: Status
+    history: list[float]
+    c: Array
+
+
+def _given(start: Any, T: int, nx: int) -> Array:
+    x = real(start, "start")
+    if x.shape != (T + 1, nx):
+        raise BadShape(f"`start` has shape {x.shape}, ({T + 1}, {nx}) was expected from the record and the model")
+    return x.copy()
+
+
+def _over(rows: "Rows", x: Array, theta: Array, unit: Array) -> float:
+    """Return the total excess of the rows over their caps, in units of the caps."""
+    return float(np.nansum(np.maximum(np.abs(rows.residuals(x, theta)) - rows.cap, 0.0) / unit))
+
+
+def _restored(rows: "Rows", x: Array, theta: Array, rounds: int) -> tuple[Array, Array, bool]:
+    """Bring the rows under their caps by programs with slack; return where that ends and whether they fit there."""
+    top = largest(rows.residuals(x, theta), rows.floor)
+    top = np.where(top > 0, top, 1.0)
+    unit = np.where(np.isfinite(rows.cap) & (rows.cap > 0), rows.cap, top)
+    over = _over(rows, x, theta, unit)
+    for _ in range(rounds):
+        # a half-width without a cap costs next to nothing: only what a cap forbids counts
+        chain = replace(rows.chain(x, theta, 1e-6 / top), slack=1.0 / unit)
+        answer = solve(chain, point="optimal")
+        if not np.isfinite(answer.x).all():
+            break
+        for share in _STEPS:
+            x_new, theta_new = x + share * (answer.x - x), theta + share * (answer.theta - theta)
+            value = _over(rows, x_new, theta_new, unit)
+            if value < over:
+                break
+        else:
+            break
+        x, theta, gain, over = x_new, theta_new, over - value, value
+        if over <= _NONE or gain <= 1e-3 * over:
+            break
+    return x, theta, over <= _NONE
+
+
+def _centred(rows: "Rows", at: "_At") -> "_At":
+    """Move to the central point of the last program, where states are estimated best."""
+    answer = solve(rows.chain(at.x, at.theta, at.c), point="central", fallback=False)
+    if answer.status is not Status.OK:
+        return at._replace(status=Status.REDUCED)
+    return at._replace(x=answer.x, theta=answer.theta, answer=answer)
+
+
+def _squared(rows: "Rows", at: "_At") -> "_At":
+    """Move to the least squares of the rows inside the half-widths of this point."""
+    s = largest(rows.residuals(at.x, at.theta), rows.floor)
+    found = squares(rows.chain(at.x, at.theta, at.c), s)
+    if found is None:
+        return at._replace(status=Status.REDUCED)
+    return at._replace(x=found[0], theta=found[1])
+
+
+class _Worth:
+    """What both kinds of rows are worth."""
+
+    floor: Array
+    cap: Array
+    nx: int
+
+    def residuals(self, x: Array, theta: Array) -> Array:
+        """Return the true residuals (T, groups), NaN where no row is."""
+        raise NotImplementedError
+
+    def worth(self, x: Array, theta: Array, c: Array) -> float:
+        """Return ``sum c_j max|rho_j|``."""
+        return float(c @ largest(self.residuals(x, theta), self.floor))
+
+    def shares(self, rho: Array) -> Array:
+        """Return N_j over the sum of all N of the half-widths sought, 0 of a known one."""
+        count = np.where(self.floor < self.cap, np.isfinite(rho).sum(axis=0), 0.0)
+        return np.asarray(count / max(float(count.sum()), 1.0))
+
+    def log_worth(self, x: Array, theta: Array) -> float:
+        """Return the mean of ``ln s_j`` over all rows."""
+        rho = self.residuals(x, theta)
+        share = self.shares(rho)
+        return float(share[share > 0] @ np.log(largest(rho, self.floor)[share > 0]))
+
+    def tangent(self, x: Array, theta: Array) -> Array:
+        """Return the costs of the program that lies above the logarithm and touches it here."""
+        rho = self.residuals(x, theta)
+        s = largest(rho, self.floor)
+        c = self.shares(rho) / np.where(s > 0, s, 1.0)
+        return c / max(float(c.max(initial=0.0)), 1e-300)
+
+
+class LinearRows(_Worth):
     """The rows of a linear model, linearised in theta; made by `rows_of`."""
 
     def __init__(self, model: Linear, record: Record, drift: float | None) -> None:
@@ -257,10 +417,6 @@ class LinearRows:
             rho += one.G @ full
         return rho
 
-    def worth(self, x: Array, theta: Array, c: Array) -> float:
-        """Return ``sum c_j max|rho_j|``."""
-        return float(c @ largest(self.residuals(x, theta), self.floor))
-
     def start(self, theta: Array) -> Array:
         """Return the least-squares trajectory at theta."""
         fixed = filled(self.model, theta[: len(self.entries)])
@@ -276,7 +432,7 @@ class LinearRows:
         return scaled_costs(np.r_[np.full(self.nx, len(self.record)), self.base.seen.sum(axis=0)], base.sigma)
 
 
-class NonlinearRows:
+class NonlinearRows(_Worth):
     """The rows of a nonlinear model, linearised about a trajectory; made by `rows_of`."""
 
     def __init__(self, model: Nonlinear, record: Record) -> None:
@@ -289,17 +445,57 @@ class NonlinearRows:
         self.floor, self.cap = half_width_bounds(model)
         self.y = np.where(record.seen, record.y, 0.0)
         self.dt = record.steps(model.dt)
+        self.tapes: dict[str, Tape | None] = {}
+
+    def _tape(self, name: str, x: Array) -> Tape | None:
+        """Return g or h recorded, or None where it is for Python to call row by row."""
+        if name not in self.tapes:
+            f = getattr(self.model, name)
+            more = (self._inputs(slice(0, 1)), self.dt[:1])[: arity(f, 3 if name == "g" else 1) - 1]
+            one = tuple(None if a is None else a[0] for a in more)
+            sizes = (self.nx, self.model.nu, None)[: 1 + len(more)]
+            picks = [x[0], x[len(x) // 2], x[-1]]
+            try:
+                self.tapes[name] = compiled(f, sizes, [(point, *one) for point in picks])
+            except Untraceable:
+                self.tapes[name] = None
+        return self.tapes[name]
+
+    def _inputs(self, rows: slice) -> Array | None:
+        if not self.model.nu:
+            return None
+        return np.zeros((len(self.record), self.model.nu))[rows] if self.record.u is None else self.record.u[rows]
+
+    def _values(self, name: str, x: Array) -> Array:
+        """Return g or h at each row's state, (T, nx) or (T, ny)."""
+        tape, u = self._tape(name, x), self._inputs(slice(None))
+        if tape is not None:
+            more = (u, self.dt[:, None])[: len(tape.sizes) - 1]
+            return tape(x, *(np.zeros((1, 0)) if a is None else a for a in more))
+        if name == "h":
+            return np.array([self.model.output(row) for row in x])
+        rows = zip(x, self.dt, strict=True)
+        return np.array([self.model.move(row, None if u is None else u[k], float(h)) for k, (row, h) in enumerate(rows)])
+
+    def _linearised(self, name: str, x: Array, u: Array | None, k: int) -> tuple[Array, Array]:
+        """Return g or h and its Jacobian at one state, where nothing is recorded."""
+        by = "differences" if getattr(self.model, f"{name}_x") is None else "user"
+        return self.model.slope(name, x, u, float(self.dt[k]), by)
 
     def _along(self, x: Array) -> tuple[Array, Array, Array, Array]:
-        T = len(self.record)
-        g, h = np.empty((T, self.nx)), np.empty((T, self.ny))
-        g_x, h_x = np.empty((T, self.nx, self.nx)), np.empty((T, self.ny, self.nx))
-        for k in range(T):
-            u = None if self.record.u is None else self.record.u[k]
-            before = self.model.linearise(x[k], u, float(self.dt[k]))
-            after = self.model.linearise(x[k + 1], u, float(self.dt[k]))
-            g[k], g_x[k], h[k], h_x[k] = before.g, before.g_x, after.h, after.h_x
-        return g, g_x, h, h_x
+        """Return g and g_x at the states before each row, h and h_x at those of the row."""
+        found: list[Array] = []
+        u = self._inputs(slice(None))
+        for name, at in (("g", x[:-1]), ("h", x[1:])):
+            tape = self._tape(name, at) if getattr(self.model, f"{name}_x") is None else None
+            if tape is not None:
+                more = (u, self.dt[:, None])[: len(tape.sizes) - 1]
+                value, slope = tape.jacobian(at, *(np.zeros((1, 0)) if a is None else a for a in more))
+            else:
+                rows = [self._linearised(name, row, None if u is None else u[k], k) for k, row in enumerate(at)]
+                value, slope = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+            found += [np.ascontiguousarray(value), np.ascontiguousarray(slope)]
+        return found[0], found[1], found[2], found[3]
 
     def _wrapped(self, difference: Array, angles: tuple[int, ...]) -> Array:
         if angles:
@@ -335,20 +531,11 @@ class NonlinearRows:
 
     def residuals(self, x: Array, theta: Array) -> Array:  # noqa: ARG002
         """Return the true residuals (T, groups), NaN where no row is."""
-        T = len(self.record)
-        rho = np.empty((T, self.groups))
-        for k in range(T):
-            u = None if self.record.u is None else self.record.u[k]
-            rho[k, : self.nx] = x[k + 1] - self.model.move(x[k], u, float(self.dt[k]))
-            rho[k, self.nx :] = self.model.output(x[k + 1]) - self.y[k]
+        rho = np.hstack([x[1:] - self._values("g", x[:-1]), self._values("h", x[1:]) - self.y])
         self._wrapped(rho[:, : self.nx], self.model.x_angles)
         rho[:, self.nx :] = self._wrapped(rho[:, self.nx :], self.model.y_angles)
         rho[:, self.nx :][~self.record.seen] = np.nan
         return rho
-
-    def worth(self, x: Array, theta: Array, c: Array) -> float:
-        """Return ``sum c_j max|rho_j|``."""
-        return float(c @ largest(self.residuals(x, theta), self.floor))
 
     def start(self, theta: Array) -> Array:  # noqa: ARG002
         """Return the trajectory of an extended Kalman smoother with the widest noise that the caps allow."""
@@ -444,34 +631,36 @@ def chain_residuals(chain: Chain, x: Array) -> Array:
     return np.hstack([w, e])
 
 
-def finished(
-    method: SequentialLP,
-    model: Model,
-    record: Record,
-    rows: Rows,
-    x: Array,
-    theta: Array,
-    c: Array,
-    status: Status,
-    answer: Answer | None,
-    history: list[float],
-) -> Estimate:
-    """Return the estimate at (x, theta)."""
+def finished(method: SequentialLP, model: Model, record: Record, rows: Rows, at: _At) -> Estimate:
+    """Return the estimate at a point."""
+    x, theta, answer, status, history, c = at
     rho = rows.residuals(x, theta)
     s = largest(rho, rows.floor)
     over = s > rows.cap * (1.0 + 1e-6)
     notes = []
+    if status is Status.INFEASIBLE:
+        notes.append("this is the trajectory of least excess over the caps that was found")
     if over.any() and status.good:
         status = Status.REDUCED
         notes.append("the linearisation leaves residuals beyond the caps")
+    free = rows.floor < rows.cap
+    kinds = [f"q[{name}]" for name in model.names.x] + [f"r[{name}]" for name in model.names.y]
+    low = free & (rows.floor > 0) & (s <= _ON_FLOOR * rows.floor) & np.isfinite(rho).any(axis=0)
+    on_floor = [name for name, here in zip(kinds, low, strict=True) if here]
+    if on_floor:
+        notes.append(f"half-width on its floor: {', '.join(on_floor)}")
     n = len(rows.entries)
+    count = np.where(free, np.isfinite(rho).sum(axis=0), 0)
+    log = float(count[count > 0] @ np.log(s[count > 0])) if method.objective == "log" else None
     info: dict[str, Any] = {
         "x0": x[0].copy(),
-        "objective": float(c @ s),
+        "objective": float(c @ s) if log is None else log,
         "rounds": len(history) - 1,
         "history": history,
         "w": rho[:, : rows.nx],
         "e": -rho[:, rows.nx :],
+        "rows": count,
+        "on_floor": on_floor,
         "notes": notes,
         "iterations": 0 if answer is None else answer.iterations,
         "solver": "banded" if answer is None else answer.by,
