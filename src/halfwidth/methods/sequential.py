@@ -560,15 +560,21 @@ class NonlinearRows(_Worth):
     def weights(self, x: Array, theta: Array) -> Array:
         """Return N_j / sigma_j with the noise level of a least-squares fit about x."""
         count = np.r_[np.full(self.nx, len(self.record)), self.record.seen.sum(axis=0)].astype(float)
-        sigma = np.where(np.isfinite(self.cap), self.cap, np.nanstd(self.residuals(x, theta), axis=0) + 1e-12)
-        least = _LEAST * sigma
+        sigma = np.where(np.isfinite(self.cap), self.cap, self._level(self.residuals(x, theta)) + 1e-12)
+        # what a start happens to fit exactly has a floor all the same
+        sigma = np.maximum(sigma, self.floor)
+        least = np.maximum(_LEAST * sigma, self.floor)
         for _ in range(_SCALINGS):
             chain = self.chain(x, theta, 1.0 / np.maximum(sigma, 1e-300))
             smooth = solve(chain, point="least_squares", fallback=False).x
             rho = chain_residuals(chain, smooth)
-            level = np.sqrt(np.nanmean(np.where(np.isnan(rho), 0.0, rho) ** 2, axis=0))
-            sigma = np.maximum(level, least)
+            sigma = np.maximum(self._level(rho), least)
         return scaled_costs(count, sigma)
+
+    def _level(self, rho: Array) -> Array:
+        """Return the root mean square of each group's residuals, 0 where it has none."""
+        there = np.isfinite(rho)
+        return np.asarray(np.sqrt((np.where(there, rho, 0.0) ** 2).sum(axis=0) / np.maximum(there.sum(axis=0), 1)))
 
 
 Rows = LinearRows | NonlinearRows
