@@ -2,7 +2,6 @@
 
 import numpy as np
 
-
 N = 9
 
 
@@ -65,7 +64,9 @@ def chain_round(
     slips = np.array(slips)
     new = []
     for g in range(7):
-        count = {1: np.where(group == 1, 1 - slips, 0.0), 2: np.where(group == 1, slips, 0.0)}.get(g, 1.0 * (group == g))
+        count = {1: np.where(group == 1, 1 - slips, 0.0), 2: np.where(group == 1, slips, 0.0)}.get(
+            g, 1.0 * (group == g)
+        )
         per_row = 2 if g >= 4 else 1  # both axes share a row of the core
         new.append(sigma[g] * np.sqrt((count @ square / per_row + 1.0) / (count.sum() / per_row + 1.0)))
     z = z.reshape(T, N)

@@ -10,7 +10,6 @@ from halfwidth.vehicle import chain
 from halfwidth.vehicle.grid import sampled
 from halfwidth.vehicle.pointing import azimuth_of
 
-
 GAUSSIAN = {"tail": np.inf}
 SIGMA = np.array([0.1, 0.05, 0.1, 0.01, 0.3, 0.1, 0.3])
 

@@ -41,6 +41,9 @@ ANTENNA_SIGMAS, ANTENNA_SD, ANTENNA_SLOW = 5.0, 0.3, 0.3
 #: Slower than this a car stands, m/s; times this near to moving are not counted, s; the least length, s.
 STANDING, EDGE, SHORTEST = 0.1, 1.0, 1.0
 
+#: The bias is told every so many seconds.
+KNOT = 30.0
+
 #: A change of a clock is believed if it makes the misfit of the pieces smaller by this much, and is this large, s.
 CHANGE_GAIN, CHANGE_LEAST = 25.0, 0.05
 
@@ -89,7 +92,10 @@ def calibrated(log: Log, *, clock_offset: float | None = None) -> Calibration:
     off = _antenna(parts, streams, known, solved, given)
     if off is not None:
         known = off
-    return _azimuth(log, known, pieces)
+    known = _azimuth(log, known, pieces)
+    t, rate = replace(known, bias=0.0, bias_at=(), still=AS_LOGGED.still).stream(log, "yaw_rate")
+    standing = rate[known.stands(t)]
+    return replace(known, still_bias=float(np.median(standing))) if standing.size >= 5 else known
 
 
 def steps_of(log: Log) -> dict[str, float]:
@@ -302,11 +308,11 @@ def _joined(known: Calibration, pieces: Sequence[reckoning.Piece], there: Sequen
             offsets[name] = given
         else:
             offsets[name] = _offset(pieces, k, float(mean[k]), float(sd[k] * max(1.0, spread[k])))
-    bias = np.array([piece.bias for piece in pieces])
+    bias = np.array([piece.bias.mean() for piece in pieces])
     # a bias drifts: the pieces count by how long they are sure of it, not by how sure
     variance = np.array([piece.bias_sd**2 for piece in pieces])
     weight = 1.0 / (variance + max(float(np.var(bias)) - float(np.median(variance)), 0.0))
-    middle = [float(piece.t[piece.t.size // 2]) for piece in pieces]
+    knots = [k for piece in pieces for k in _knots(piece)]
     some = float(weight @ bias / weight.sum())
     scale_known = bool(sd[0] < 0.5 * reckoning.PRIOR[0]) and "speed" in there
     yaw_known = "yaw_rate" in there
@@ -317,10 +323,17 @@ def _joined(known: Calibration, pieces: Sequence[reckoning.Piece], there: Sequen
         scale_sd=float(sd[0] * max(1.0, spread[0])) if scale_known else float("inf"),
         bias=some if yaw_known else 0.0,
         bias_sd=float(weight.sum() ** -0.5) if yaw_known else float("inf"),
-        bias_at=tuple(zip(middle, bias.tolist(), strict=True)) if yaw_known and len(pieces) > 1 else (),
+        bias_at=tuple(knots) if yaw_known else (),
         slip=float(np.median([piece.sigma[1] for piece in pieces])),
         noise=dict(zip(reckoning.GROUPS, np.median([piece.sigma for piece in pieces], axis=0).tolist(), strict=True)),
     )
+
+
+def _knots(piece: reckoning.Piece) -> list[tuple[float, float]]:
+    """Return times, about `KNOT` apart, and the mean bias around each."""
+    n = max(1, round(float(piece.t[-1] - piece.t[0]) / KNOT))
+    parts = np.array_split(np.arange(piece.t.size), min(n, piece.t.size))
+    return [(float(piece.t[part].mean()), float(piece.bias[part].mean())) for part in parts]
 
 
 def _together(pieces: Sequence[reckoning.Piece]) -> tuple[Floats, Floats, Floats]:

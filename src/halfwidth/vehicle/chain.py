@@ -265,7 +265,7 @@ def _rows(drives: Sequence[Grid]) -> _Rows:
 
 
 def _in_gap(drive: Grid) -> Mask:
-    """Return the steps between fixes that are much further apart than usual, and before the first and after the last."""
+    """Return the steps between fixes much further apart than usual, and before the first and after the last."""
     seen = np.flatnonzero(drive.seen)
     after = np.searchsorted(seen, np.arange(len(drive)))
     apart = np.concatenate(([np.inf], np.diff(drive.t[seen]), [np.inf]))
@@ -460,9 +460,7 @@ def _learnt(rows: _Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Flo
     return np.clip(new, _FLOOR**2, _CEILING**2)
 
 
-def _fit(
-    rows: _Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain
-) -> Fit:
+def _fit(rows: _Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain) -> Fit:
     part = slice(int(rows.offsets[i]), int(rows.offsets[i + 1]))
     z, P = out.x[part].copy(), out.P[part]
     z[:, [E, N]] += rows.origin[i]

@@ -9,6 +9,11 @@ cv            constant velocity, Rauch-Tung-Striebel smoother
 gpsins        the linear GPS/INS model of Pavelková (2011) with that smoother, acceleration from speed and azimuth
 ctrv          constant turn rate and velocity, extended Kalman smoother, with speed scale and yaw bias
 em            the chain of `halfwidth.vehicle.chain`, the default of `fill`
+em-slow       the same, the fix error a Gaussian offset without drift and jumps
+em-white      the same, the fix error white noise
+slp           the same with bounded noise by sequential linear programming, central point (`bounded`)
+slp-white     the same, the fix error without an offset
+slp-log       that with the logarithmic objective
 paper000      GPS/INS by linear programming, half-widths unknown, as printed in Pavelková (2011)
 paper000+ls   the same, least squares inside the optimal half-widths
 paper002      the linearised two-antenna model with one antenna, middle azimuth, least squares likewise
@@ -31,7 +36,7 @@ from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Normal
-from halfwidth.vehicle import chain, models
+from halfwidth.vehicle import bounded, chain, models
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
@@ -342,9 +347,22 @@ def _two_antenna(drive: Grid) -> tuple[Linear, Floats]:
 # ---- the chain -----------------------------------------------------------------------------------------------------
 
 
-def _chain(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:  # noqa: ARG001
-    return [fit.path for fit in chain.solve(drives)]
+def _chain(settings: chain.Chain) -> Callable[[Sequence[Grid], Tuned], list[Path]]:
+    return lambda drives, tuned: [fit.path for fit in chain.solve(drives, settings)]  # noqa: ARG005
 
+
+def _bounded(settings: bounded.Bounded) -> Callable[[Sequence[Grid], Tuned], list[Path]]:
+    return lambda drives, tuned: bounded.solve(drives, settings)  # noqa: ARG005
+
+
+#: What the chain may take the error of a fix for; the first is the usual one.
+COLOURS: Mapping[str, chain.Chain] = MappingProxyType(
+    {
+        "em": chain.Chain(),
+        "em-slow": chain.Chain(tail=np.inf, drifting=False),
+        "em-white": chain.Chain(slow=False),
+    }
+)
 
 _SENSORS = ("speed", "yaw_rate")
 
@@ -357,7 +375,20 @@ METHODS: Mapping[str, Method] = MappingProxyType(
             Method("cv", "constant velocity, RTS smoother", 20.0, (), _smoothed(False), _tuned(False)),
             Method("gpsins", "linear GPS/INS, RTS smoother", 20.0, _SENSORS, _smoothed(True), _tuned(True)),
             Method("ctrv", "constant turn rate and velocity, EKF + RTS", 20.0, _SENSORS, _turning, _tuned_ctrv),
-            Method("em", "chain that learns its own noise", 60.0, (), _chain, one_of=_SENSORS),
+            *(
+                Method(
+                    name, f"chain that learns its own noise{words}", 60.0, (), _chain(COLOURS[name]), one_of=_SENSORS
+                )
+                for name, words in (("em", ""), ("em-slow", ", slow fix error"), ("em-white", ", white fix error"))
+            ),
+            *(
+                Method(name, f"chain with bounded noise{words}", 20.0, (), _bounded(settings), one_of=_SENSORS)
+                for name, words, settings in (
+                    ("slp", "", bounded.Bounded()),
+                    ("slp-white", ", no fix offset", bounded.Bounded(slow=False)),
+                    ("slp-log", ", log objective", bounded.Bounded(objective="log", slow=False)),
+                )
+            ),
             Method(
                 "paper000",
                 "GPS/INS by linear programming, as printed",

@@ -47,7 +47,7 @@ _CEILING = np.array([30.0, 3.0, 3.0, 30.0, 1e3])
 _FREEDOM, _MEMORY = 4.0, 60.0
 
 #: Walks of scale and bias a root second.
-_SCALE_WALK, _BIAS_WALK = 1e-4, 3e-5
+_SCALE_WALK, _BIAS_WALK = 1e-4, 1e-4
 
 #: Half the distance of the samples that give the derivatives, and how far a clock moves in one round at most, s.
 _APART, _STEP = 0.1, 0.4
@@ -73,8 +73,10 @@ class Piece:
         Speed scale, offset of the speed's and of the yaw rate's clock (s), antenna ahead and to the left (m).
     information : (5, 5) array
         Inverse covariance of these, without what the prior added.
-    bias, bias_sd : float
-        Mean bias, rad/s.
+    bias : (T,) array
+        rad/s.
+    bias_sd : float
+        Standard deviation of its mean, rad/s.
     azimuth : (T,) array
         rad.
     sigma : (5,) array
@@ -87,7 +89,7 @@ class Piece:
     t: Floats
     mean: Floats
     information: Floats = field(repr=False)
-    bias: float
+    bias: Floats = field(repr=False)
     bias_sd: float
     azimuth: Floats = field(repr=False)
     sigma: Floats
@@ -183,7 +185,7 @@ def solve(
             break
     if found is None:
         nothing = np.array([1.0, *clocks, 0.0, 0.0])
-        return Piece(grid.t, nothing, np.zeros((5, 5)), 0.0, np.inf, np.zeros(T), sigma, loglik, False)
+        return Piece(grid.t, nothing, np.zeros((5, 5)), np.zeros(T), np.inf, np.zeros(T), sigma, loglik, False)
     return _answer(grid, *found, prior, sigma, loglik)
 
 
@@ -302,7 +304,7 @@ def _answer(grid: Grid, x: Floats, P: Floats, clock: Floats, prior: Floats, sigm
         grid.t,
         mean,
         information,
-        float(x[:, BIAS].mean()),
+        x[:, BIAS].copy(),
         float(np.sqrt(P[k, BIAS, BIAS])),
         x[:, AZIMUTH].copy(),
         sigma,

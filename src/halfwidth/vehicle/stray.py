@@ -121,6 +121,7 @@ def strays(grid: Grid, sensors: Calibration) -> Strays:
     settings = chain.Chain(
         rounds=_ROUNDS,
         drifting=False,
+        tail=np.inf,
         scale_sd=float(np.clip(_KNOWN * sensors.scale_sd, _SCALE, 0.03)),
         bias_sd=float(np.clip(_KNOWN * sensors.bias_sd, _BIAS, 0.01)),
     )
