@@ -54,6 +54,8 @@ _SCALINGS = 3
 _NONE = 1e-6
 #: A half-width within this factor of its floor sits on it.
 _ON_FLOOR = 1.0 + 1e-3
+#: Gauss-Newton steps to a state that gives the first outputs.
+_FITTING = 6
 #: A scale stays above this share of the cap (or of the first residuals): a smooth fit must not make one vanish.
 _LEAST = 0.03
 
@@ -182,7 +184,11 @@ class SequentialLP:
         for _ in range(self.rounds):
             if log:
                 c = rows.tangent(x, theta)
-            answer = solve(rows.chain(x, theta, c), point=point)
+            chain = rows.chain(x, theta, c)
+            if not all(np.isfinite(part).all() for part in (chain.A, chain.C, chain.bx, chain.by, chain.c)):
+                status = Status.STALLED  # g or h has no derivative here
+                break
+            answer = solve(chain, point=point)
             status = answer.status
             if status is Status.INFEASIBLE and restored < _RESTORATIONS:
                 restored += 1
@@ -433,7 +439,10 @@ class LinearRows(_Worth):
 
 
 class NonlinearRows(_Worth):
-    """The rows of a nonlinear model, linearised about a trajectory; made by `rows_of`."""
+    """The rows of a nonlinear model, linearised about a trajectory; made by `rows_of`.
+
+    An `h` that cannot be recorded may offer ``rows(x)``, values and Jacobians at many states at once.
+    """
 
     def __init__(self, model: Nonlinear, record: Record) -> None:
         self.model, self.record = model, record
@@ -468,6 +477,8 @@ class NonlinearRows(_Worth):
 
     def _values(self, name: str, x: Array) -> Array:
         """Return g or h at each row's state, (T, nx) or (T, ny)."""
+        if name == "h" and hasattr(self.model.h, "rows"):
+            return np.asarray(self.model.h.rows(x)[0])
         tape, u = self._tape(name, x), self._inputs(slice(None))
         if tape is not None:
             more = (u, self.dt[:, None])[: len(tape.sizes) - 1]
@@ -482,18 +493,21 @@ class NonlinearRows(_Worth):
         by = "differences" if getattr(self.model, f"{name}_x") is None else "user"
         return self.model.slope(name, x, u, float(self.dt[k]), by)
 
-    def _along(self, x: Array) -> tuple[Array, Array, Array, Array]:
-        """Return g and g_x at the states before each row, h and h_x at those of the row."""
+    def _along(self, x: Array, rows: int | None = None) -> tuple[Array, Array, Array, Array]:
+        """Return g and g_x at the states before each row, h and h_x at those of the row; of the first rows."""
         found: list[Array] = []
-        u = self._inputs(slice(None))
+        u, dt = self._inputs(slice(rows)), self.dt[:rows]
         for name, at in (("g", x[:-1]), ("h", x[1:])):
+            if name == "h" and hasattr(self.model.h, "rows"):
+                found += [np.ascontiguousarray(part) for part in self.model.h.rows(at)]
+                continue
             tape = self._tape(name, at) if getattr(self.model, f"{name}_x") is None else None
             if tape is not None:
-                more = (u, self.dt[:, None])[: len(tape.sizes) - 1]
+                more = (u, dt[:, None])[: len(tape.sizes) - 1]
                 value, slope = tape.jacobian(at, *(np.zeros((1, 0)) if a is None else a for a in more))
             else:
-                rows = [self._linearised(name, row, None if u is None else u[k], k) for k, row in enumerate(at)]
-                value, slope = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+                each = [self._linearised(name, row, None if u is None else u[k], k) for k, row in enumerate(at)]
+                value, slope = np.array([row[0] for row in each]), np.array([row[1] for row in each])
             found += [np.ascontiguousarray(value), np.ascontiguousarray(slope)]
         return found[0], found[1], found[2], found[3]
 
@@ -545,7 +559,7 @@ class NonlinearRows(_Worth):
         x0 = self.model.x0
         if isinstance(x0, Box):
             half = np.where(np.isfinite(x0.hi - x0.lo), 0.5 * (x0.hi - x0.lo), 1e3)
-            x0 = Normal(x0.mean, np.diag(np.maximum(half, 1e-9) ** 2 / 3.0))
+            x0 = Normal(self._fitting(x0), np.diag(np.maximum(half, 1e-9) ** 2 / 3.0))
         gaussian = dataclasses.replace(
             self.model, w=Gaussian(np.diag(top[: self.nx])), e=Gaussian(np.diag(top[self.nx :])), x0=x0, bounds=None
         )
@@ -557,6 +571,27 @@ class NonlinearRows(_Worth):
             x = np.tile(x0.mean, (len(self.record) + 1, 1))
         return x if self.model.bounds is None else np.clip(x, self.model.bounds.lo, self.model.bounds.hi)
 
+    def _fitting(self, box: Box) -> Array:
+        """Return a state of the box that gives the first outputs seen, as nearly as Gauss-Newton finds one.
+
+        The middle of a wide box may be where an output has no derivative, such as the azimuth of a line of no length.
+        """
+        seen = self.record.seen
+        first = np.argmax(seen, axis=0)
+        there = seen.any(axis=0)
+        y = np.where(there, self.record.y[first, np.arange(self.ny)], 0.0)
+        room = np.where(np.isfinite(box.hi - box.lo), box.hi - box.lo, 1.0)
+        aside = np.clip(box.mean + 1e-3 * np.minimum(room, 1.0) * np.cos(np.arange(1.0, self.nx + 1)), box.lo, box.hi)
+        x = aside
+        for _ in range(_FITTING):
+            h, h_x = (part[0] for part in self._along(np.vstack([x, x]), 1)[2:])
+            if not (np.isfinite(h).all() and np.isfinite(h_x).all()):
+                return np.asarray(box.mean)
+            miss = self._wrapped((y - h)[None], self.model.y_angles)[0]
+            step = np.linalg.lstsq(h_x[there], miss[there], rcond=None)[0]
+            x = np.clip(x + step, box.lo, box.hi)
+        return np.asarray(x if np.isfinite(x).all() else box.mean)
+
     def weights(self, x: Array, theta: Array) -> Array:
         """Return N_j / sigma_j with the noise level of a least-squares fit about x."""
         count = np.r_[np.full(self.nx, len(self.record)), self.record.seen.sum(axis=0)].astype(float)
@@ -567,6 +602,8 @@ class NonlinearRows(_Worth):
         for _ in range(_SCALINGS):
             chain = self.chain(x, theta, 1.0 / np.maximum(sigma, 1e-300))
             smooth = solve(chain, point="least_squares", fallback=False).x
+            if not np.isfinite(smooth).all():
+                break
             rho = chain_residuals(chain, smooth)
             sigma = np.maximum(self._level(rho), least)
         return scaled_costs(count, sigma)

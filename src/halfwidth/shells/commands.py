@@ -127,6 +127,20 @@ def fill(
     method: Annotated[str | None, typer.Option(metavar="NAME", help="Estimator; the default needs no tuning.")] = None,
     level: Level = 0.9,
     clock_offset: ClockOffset = None,
+    second: Annotated[
+        str | None, typer.Option(metavar="LOG", help="Fixes of a second antenna on the same clock (method paper002).")
+    ] = None,
+    map_: Annotated[
+        str | None, typer.Option("--map", metavar="GEOJSON", help="Roads that gaps are kept on (method paper002).")
+    ] = None,
+    limits: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME=MOST,...",
+            help="Limits of speed, acceleration, yaw_rate, altitude, pitch (method paper002):"
+            " speed=0:30,acceleration=4,yaw_rate=0.8 in m/s, m/s^2, rad/s, m, rad.",
+        ),
+    ] = None,
     columns: Columns = None,
     json_: Json = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Read and check everything, write nothing.")] = False,
@@ -156,7 +170,13 @@ def fill(
         _writable(path, log, force)
     if output is not None:
         _ending_known(output, format_)
-    job = Job("fill", log, method=method, level=level, settings={"clock_offset": clock_offset},
+    settings: dict[str, Any] = {"clock_offset": clock_offset}
+    settings |= {name: value for name, value in (("second", second), ("roads", map_)) if value is not None}
+    if limits is not None:
+        from halfwidth.vehicle.antennas import parsed_limits
+
+        settings["limits"] = parsed_limits(limits)
+    job = Job("fill", log, method=method, level=level, settings=settings,
               columns=parse_columns(columns or ""))  # fmt: skip
     if dry_run:
         found = read(log, columns=job.columns)

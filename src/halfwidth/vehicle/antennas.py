@@ -31,10 +31,11 @@ from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box
-from halfwidth.vehicle import chain, models
-from halfwidth.vehicle.frames import wrapped
+from halfwidth.trace import Tape, compiled
+from halfwidth.vehicle import models
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
+from halfwidth.vehicle.pointing import azimuth_of
 from halfwidth.vehicle.roads import Streets
 
 Floats = NDArray[np.float64]
@@ -94,7 +95,7 @@ class TwoAntennas:
     euler: bool = False
     nonlinear: bool = True
     objective: Literal["log", "scaled", "paper"] = "log"
-    point: Literal["central", "least_squares", "optimal"] = "least_squares"
+    point: Literal["central", "least_squares", "optimal"] = "optimal"
 
 
 def limits_of(given: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
@@ -130,6 +131,29 @@ def limits_of(given: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     return found
 
 
+def parsed_limits(text: str) -> dict[str, tuple[float, float]]:
+    """Read limits as they are typed, ``speed=0:30,acceleration=4``; see `limits_of`.
+
+    Raises
+    ------
+    BadValue
+        If the text is not of that form.
+    """
+    given: dict[str, Any] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name, _, value = part.partition("=")
+        try:
+            ends = [float(end) for end in value.split(":")]
+        except ValueError:
+            ends = []
+        if len(ends) not in (1, 2):
+            raise BadValue(
+                f"the limit {part!r} is not NAME=SIZE or NAME=LEAST:MOST", hint="--limits speed=0:30,acceleration=4"
+            )
+        given[name.strip()] = ends
+    return limits_of(given)
+
+
 def solve(drives: Sequence[Grid], settings: TwoAntennas | None = None) -> list[Path]:
     """Estimate drives, outage by outage.
 
@@ -152,7 +176,7 @@ def solve(drives: Sequence[Grid], settings: TwoAntennas | None = None) -> list[P
 def _drive(drive: Grid, settings: TwoAntennas) -> Path:
     seen = np.flatnonzero(drive.seen)
     columns = {"east": _through(drive, drive.east), "north": _through(drive, drive.north)}
-    columns |= {"azimuth": chain.azimuth_of(drive), "speed": drive.speed.copy()}
+    columns |= {"azimuth": azimuth_of(drive), "speed": drive.speed.copy()}
     extra: dict[str, Floats] = {}
     if settings.height:
         known = np.zeros(0) if drive.height is None else np.flatnonzero(np.isfinite(drive.height))
@@ -189,6 +213,9 @@ def _drive(drive: Grid, settings: TwoAntennas) -> Path:
         notes.append(f"{sum(not one.good for one in fits)} of {len(fits)} outages: the linearised model's path")
     elif any(one is Status.REDUCED for one in fits):
         status = Status.REDUCED
+    if on_floor:
+        words = ", ".join(f"{name} in {n}" for name, n in sorted(on_floor.items()))
+        notes.append(f"half-widths on their floor, of {len(fits)} outage{'s' if len(fits) > 1 else ''}: {words}")
     info = {"q": q, "r": r, "on_floor": on_floor, "outages": len(fits), "notes": list(dict.fromkeys(notes)), **extra}
     return Path(drive.t, columns["east"], columns["north"], columns["azimuth"], columns["speed"], None, 0.0, status, info)
 
@@ -268,7 +295,7 @@ def problem(drive: Grid, settings: TwoAntennas) -> tuple[Nonlinear, Record, Floa
     """
     notes: list[str] = []
     origin, h = _origin(drive), drive.h
-    phi = chain.azimuth_of(drive)
+    phi = azimuth_of(drive)
     speed, turn = (np.concatenate((s[1:], s[-1:])) for s in (drive.speed, drive.yaw_rate))
     silent = [np.concatenate((s[1:], s[-1:])) > 0 for s in (drive.speed_sd, drive.yaw_rate_sd)]
     first = np.column_stack((drive.east, drive.north)) - origin
@@ -335,8 +362,8 @@ def _model(drive: Grid, settings: TwoAntennas, baseline: Floats | None, h: float
     q_lo = np.array([STATE_FLOORS[name.rstrip("12")] for name in states])
     q_hi = np.full(len(states), np.inf)
     if driven:
-        # the speed follows the acceleration, whose limits would mean nothing if it could jump besides
-        q_hi[states.index("speed")] = q_lo[states.index("speed")] = 1e-3
+        # the speed follows the acceleration, whose limits would mean little if it could jump besides
+        q_lo[states.index("speed")], q_hi[states.index("speed")] = 1e-3, 0.02
     steps = {name: 0.5 * drive.steps.get(stream, 0.0) for name, stream in _STREAM.items()}
     r_lo = np.array([max(OUTPUT_FLOORS[name.rstrip("12")], steps.get(name, 0.0)) for name in outputs])
     r_hi = np.full(len(outputs), np.inf)
@@ -372,23 +399,48 @@ def _model(drive: Grid, settings: TwoAntennas, baseline: Floats | None, h: float
     return _on_roads(model, settings.roads, _origin(drive), antennas, np.r_[r_lo, 1.0], np.r_[r_hi, 1.0])
 
 
+@dataclass(frozen=True, eq=False)
+class OnRoads:
+    """Outputs of a model and one more: the distance from the middle of the road over the road's half-width.
+
+    Parameters
+    ----------
+    plain : Tape
+        The outputs without it.
+    roads : Streets
+    origin : (2,) array
+        Where the states' own zero is, east and north, m.
+    azimuth : int
+        Which state the azimuth is.
+    """
+
+    plain: Tape
+    roads: Streets
+    origin: Floats
+    azimuth: int
+
+    def __call__(self, x: Floats) -> Floats:
+        """Return the outputs at one state."""
+        return self.rows(x[None])[0][0]
+
+    def slope(self, x: Floats) -> Floats:
+        """Return their Jacobian at one state."""
+        return self.rows(x[None])[1][0]
+
+    def rows(self, x: Floats) -> tuple[Floats, Floats]:
+        """Return outputs (n, ny) and Jacobians (n, ny, nx) at states (n, nx)."""
+        value, slope = self.plain.jacobian(x)
+        near = self.roads.nearest(x[:, 0] + self.origin[0], x[:, 1] + self.origin[1], x[:, self.azimuth])
+        more = np.zeros((len(x), 1, x.shape[1]))
+        more[:, 0, :2] = near.slope
+        return np.column_stack((value, near.offset)), np.concatenate((slope, more), axis=1)
+
+
 def _on_roads(model: Nonlinear, roads: Streets, origin: Floats, antennas: int, r_lo: Floats, r_hi: Floats) -> Nonlinear:
-    """Return the model with one more output: the distance from the middle of the road over its half-width."""
-    a, plain = 2 * antennas, model
-
-    def h(x: Any) -> Any:
-        near = roads.nearest(x[0] + origin[0], x[1] + origin[1], x[a])
-        return np.append(plain.output(x), near.offset)
-
-    def h_x(x: Any) -> Any:
-        near = roads.nearest(x[0] + origin[0], x[1] + origin[1], x[a])
-        row = np.zeros((1, plain.nx))
-        row[0, :2] = near.slope[0]
-        return np.vstack([plain.slope("h", x, None, plain.dt)[1], row])
-
-    e = Uniform.unknown(at_least=r_lo, at_most=r_hi)
-    names = plain.names._replace(y=(*plain.names.y, "road"))
-    return replace(plain, h=h, h_x=h_x, e=e, names=names)
+    """Return the model with the road as one more output."""
+    h = OnRoads(compiled(model.h, (model.nx,), [(model.x0.mean,)]), roads, origin, 2 * antennas)
+    names = model.names._replace(y=(*model.names.y, "road"))
+    return replace(model, h=h, h_x=h.slope, e=Uniform.unknown(at_least=r_lo, at_most=r_hi), names=names)
 
 
 def _kept(drive: Grid, roads: Streets | None, at: Floats, phi: Floats) -> tuple[Floats, list[str]]:
@@ -415,8 +467,3 @@ def _baseline(first: Floats, second: Floats, phi: Floats) -> Floats:
     sin, cos = np.sin(phi), np.cos(phi)
     ahead, left = d[:, 0] * sin + d[:, 1] * cos, -d[:, 0] * cos + d[:, 1] * sin
     return np.array([np.nanmedian(ahead), np.nanmedian(left)])
-
-
-def azimuth_error(found: Floats, true: Floats) -> Floats:
-    """Return the difference of two azimuths, wrapped, rad."""
-    return wrapped(found - true)

@@ -191,6 +191,7 @@ def two_antenna(
         return np.array(seen + ([x[a]] if heading else []) + ([x[a + 3]] if height else []))
 
     numbers = ("1", "2") if antennas == 2 else ("",)
+    x0 = x0.sized(n + acceleration, "x0") if isinstance(x0, Box) else x0
     places = tuple(f"{axis}{k}" for k in numbers for axis in ("east", "north"))
     states = (*places, "azimuth", "speed", "yaw_rate", *(("altitude", "pitch") if height else ()))
     outputs = (*states[: a + 3], *(("heading",) if heading else ()), *(("altitude",) if height else ()))

@@ -169,6 +169,13 @@ class Streets:
         return Nearest(sign * distance / half, normal / half[:, None], distance, half)
 
 
+def roads_of(given: Any) -> Roads:
+    """Return roads from a path to a GeoJSON file, its content as a dict, or roads."""
+    if isinstance(given, Roads):
+        return given
+    return Roads.read(given) if isinstance(given, str | os.PathLike) else Roads.of(given)
+
+
 def _lines(given: Any, usual: float) -> Iterator[tuple[Any, float]]:
     """Yield each line of a GeoJSON object, as lists of [longitude, latitude], with its half-width."""
     kind = given.get("type") if isinstance(given, dict) else None
