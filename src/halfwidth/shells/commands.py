@@ -420,7 +420,10 @@ def doctor(json_: Json = False) -> int:
 
 @app.command(epilog="Example: halfwidth reproduce 003 --quick")
 def reproduce(
-    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000 or 003.")],
+    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000, 001, 002 or 003.")],
+    logs: Annotated[
+        list[str] | None, typer.Argument(metavar="LOG...", help="Logs of drives to run papers 000 and 002 on as well.")
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A small part of each experiment.")] = False,
     json_: Json = False,
 ) -> int:
@@ -430,7 +433,9 @@ def reproduce(
     if paper not in papers.PAPERS:
         known = ", ".join(papers.PAPERS)
         raise _usage(f"`{paper}` is no paper that is reproduced here, one of {known} is expected", "reproduce 003")
-    found = papers.tables(paper, quick=quick)
+    if logs and paper not in papers.ON_LOGS:
+        raise _usage(f"paper {paper} is not about vehicles, a log has no use", f"reproduce {papers.ON_LOGS[-1]} LOG")
+    found = papers.tables(paper, quick=quick, logs=logs or ())
     if json_:
         tables = [
             {"title": t.title, "header": list(t.header), "rows": [list(r) for r in t.rows], "notes": list(t.notes)}
