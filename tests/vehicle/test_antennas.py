@@ -50,11 +50,16 @@ def test_the_equations_are_those_of_the_slides():
     car = models.two_antenna(np.full(7, 0.1), np.full(7, 0.1), x0=hw.Box(-1, 1), baseline=(0, -1.2), euler=True)
     x, h = np.array([1.0, 2, 3, 4, 0.3, 10, 0.2]), 0.1
     east, north = h * 10 * np.sin(0.3), h * 10 * np.cos(0.3)
-    np.testing.assert_allclose(
-        car.move(x, None, h), [1 + east, 2 + north, 3 + east, 4 + north, 0.3 - h * 0.2, 10, 0.2]
-    )
+    np.testing.assert_allclose(car.move(x, None, h), [1 + east, 2 + north, 3 + east, 4 + north, 0.3 - h * 0.2, 10, 0.2])
     # antenna 2 lies to the right: the line points a quarter to the right of the car
     np.testing.assert_allclose(car.output(x), [1, 2, 3, 4, np.arctan2(2, 2) - np.pi / 2, 10, 0.2])
+
+
+def test_a_rigid_line_turns_with_the_car():
+    car = models.two_antenna(np.full(7, 0.1), np.full(7, 0.1), x0=hw.Box(-1, 1), baseline=(2.0, 0.0), rigid=True)
+    x = car.move(np.array([0, 0, 0, 2, 0, 5, -np.pi / 2]), None, 1.0)  # a quarter turn to the right
+    np.testing.assert_allclose(x[2:4] - x[:2], [2, 0], atol=1e-12)
+    assert car.output(x)[4] == pytest.approx(x[4])
 
 
 def test_height_and_acceleration_extend_them():
@@ -63,9 +68,7 @@ def test_height_and_acceleration_extend_them():
     )
     x, h = np.array([0.0, 0, 0, 10, 0, 200, 0.1, 2]), 0.5
     way = 5 + 0.25
-    np.testing.assert_allclose(
-        car.move(x, None, h), [0, way * np.cos(0.1), 0, 11, 0, 200 + way * np.sin(0.1), 0.1, 2]
-    )
+    np.testing.assert_allclose(car.move(x, None, h), [0, way * np.cos(0.1), 0, 11, 0, 200 + way * np.sin(0.1), 0.1, 2])
     assert car.names.y == ("east", "north", "azimuth", "speed", "yaw_rate", "altitude")
 
 
@@ -107,7 +110,7 @@ def test_missing_sensor_rows_are_missing_inequalities(drive):
     a, b = truth.outages[0]
     silent = (grid.t > a + 4) & (grid.t < a + 5)
     holed = replace(grid, speed=np.where(silent, 1e3, grid.speed), speed_sd=np.where(silent, 1.0, 0.0))
-    model, record, start, _ = antennas.problem(grid, TwoAntennas())
+    model, _, start, _ = antennas.problem(grid, TwoAntennas())
     _, part, _, _ = antennas.problem(holed, TwoAntennas())
     k = model.names.y.index("speed")
     assert np.isnan(part.y[:, k]).sum() == silent.sum()
@@ -173,7 +176,9 @@ def test_the_nearest_road_is_the_one_driven_along():
     )  # fmt: skip
     near = streets.nearest([3.0, 3.0], [2.0, 2.0], [np.pi / 2, 0.0])
     np.testing.assert_allclose(near.distance, [2, 3], atol=0.02)
-    np.testing.assert_allclose(near.offset, [-2 / 5, 3 / 5], atol=0.01)  # left of the one to the east, right of the other
+    np.testing.assert_allclose(
+        near.offset, [-2 / 5, 3 / 5], atol=0.01
+    )  # left of the one to the east, right of the other
     for d in ([1e-3, 0], [0, 1e-3]):
         moved = streets.nearest(3.0 + d[0], 2.0 + d[1], [0.0]).offset - streets.nearest(3.0, 2.0, [0.0]).offset
         assert moved[0] == pytest.approx(near.slope[1] @ d, abs=1e-9)
@@ -220,8 +225,7 @@ def test_the_window_form_ends_where_the_batch_ends():
 
 
 def test_scales_and_degenerate_drives(drive):
-    truth, log = drive
-    grid = sampled(log)
+    grid = sampled(drive[1])
     nothing = grid.masked(np.arange(len(grid)) > 3)
     (path,) = antennas.solve([nothing])
     assert path.finite

@@ -27,6 +27,7 @@ logarithmic objective.
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -180,7 +181,7 @@ class SequentialLP:
 
         best = worth(x, theta)
         history = [*history, best]
-        first, restored = not log, 0
+        first, restored, moved = not log, 0, False
         for _ in range(self.rounds):
             if log:
                 c = rows.tangent(x, theta)
@@ -188,8 +189,18 @@ class SequentialLP:
             if not all(np.isfinite(part).all() for part in (chain.A, chain.C, chain.bx, chain.by, chain.c)):
                 status = Status.STALLED  # g or h has no derivative here
                 break
-            answer = solve(chain, point=point)
+            answer = solve(chain, point=point, fallback=False)
             status = answer.status
+            if not status.good:
+                # a step is judged by the true objective, so it need not be certified, and neither need be the last one
+                if _betters(answer, worth, best):
+                    status = Status.REDUCED
+                elif moved and status is not Status.INFEASIBLE:
+                    status = Status.REDUCED
+                    break
+                else:
+                    answer = solve(chain, point=point)
+                    status = answer.status
             if status is Status.INFEASIBLE and restored < _RESTORATIONS:
                 restored += 1
                 x, theta, fits = _restored(rows, x, theta, self.rounds)
@@ -208,7 +219,7 @@ class SequentialLP:
                     break
             else:
                 break
-            x, theta, gain, best = x_new, theta_new, best - value, value
+            x, theta, gain, best, moved = x_new, theta_new, best - value, value, True
             history.append(value)
             if abs(gain) <= self.tol * (1.0 if log else max(abs(value), 1e-300)) and not first:
                 break
@@ -225,6 +236,12 @@ class _At(NamedTuple):
     status: Status
     history: list[float]
     c: Array
+
+
+def _betters(answer: Answer, worth: Callable[[Array, Array], float], best: float) -> bool:
+    """Whether an answer that is not certified lowers the true objective all the same."""
+    finite = np.isfinite(answer.x).all() and np.isfinite(answer.theta).all()
+    return bool(finite and worth(answer.x, answer.theta) < best)
 
 
 def _given(start: Any, T: int, nx: int) -> Array:
@@ -486,7 +503,9 @@ class NonlinearRows(_Worth):
         if name == "h":
             return np.array([self.model.output(row) for row in x])
         rows = zip(x, self.dt, strict=True)
-        return np.array([self.model.move(row, None if u is None else u[k], float(h)) for k, (row, h) in enumerate(rows)])
+        return np.array(
+            [self.model.move(row, None if u is None else u[k], float(h)) for k, (row, h) in enumerate(rows)]
+        )
 
     def _linearised(self, name: str, x: Array, u: Array | None, k: int) -> tuple[Array, Array]:
         """Return g or h and its Jacobian at one state, where nothing is recorded."""

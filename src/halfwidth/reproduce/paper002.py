@@ -81,7 +81,7 @@ def tolerance(*, quick: bool = False) -> Table:
             "The slides print these for parts of one real drive with differential GPS; the log is not public and the"
             " slides' own numbers are in figures, so simulated drives stand for it.",
             "Rows are 0.2 s apart (the grid of `fill`) where the slides have 0.1 s; the azimuth is that in the middle"
-            " of a step where the slides have that at its start.",
+            " of a step where the slides have that at its start, and the line between the antennas turns with the car.",
         ),
     )
 
@@ -98,10 +98,10 @@ def against_length(*, quick: bool = False) -> Table:
             cells.append(f"{np.mean(np.concatenate(off)):.2f} / {np.mean([o.max() for o in off]):.2f}")
         rows.append((length, *cells))
     return Table(
-        f"Distance of the first antenna against the length of the outage, {len(seeds)} drives: mean / mean of maxima, m",
+        f"Error of the first antenna by length of the outage, {len(seeds)} drives: mean / mean of maxima, m",
         ("outage, s", *ESTIMATORS),
         tuple(rows),
-        ("A second antenna fixes the heading at the edges of an outage; inside it nothing but speed and yaw rate counts.",),
+        ("A second antenna fixes the heading at the edges of an outage; inside, speed and yaw rate count.",),
     )
 
 

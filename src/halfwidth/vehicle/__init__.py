@@ -17,6 +17,7 @@ _HOME: dict[str, str] = {
     "Log": "log",
     "METHODS": "estimators",
     "Outages": "outage",
+    "Roads": "roads",
     "Track": "track",
     "check": "check",
     "constant_velocity": "models",
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from halfwidth.vehicle.models import two_antenna_linear as two_antenna_linear
     from halfwidth.vehicle.outage import Outages as Outages
     from halfwidth.vehicle.outage import outages as outages
+    from halfwidth.vehicle.roads import Roads as Roads
     from halfwidth.vehicle.track import Gap as Gap
     from halfwidth.vehicle.track import Track as Track
 

@@ -12,9 +12,10 @@ outage at a time, with some seconds of data on both sides:
 2. the linearised model, whose input is the displacement reckoned with that azimuth, by linear programming;
 3. the nonlinear model from there, by `SequentialLP` with the logarithmic objective.
 
-Added to the slides: one antenna where there is no second, the azimuth in the middle of a step, states held within
-limits (speed, acceleration, yaw rate), altitude and pitch, and roads that the track stays on inside outages. A road is
-an output: the distance from its middle in units of its half-width, known to be within 1.
+Added to the slides: one antenna where there is no second, the azimuth in the middle of a step, the line between the
+antennas that turns with the vehicle, the receiver's azimuth as an output of the state as well as of that line, states
+held within limits (speed, acceleration, yaw rate), altitude and pitch, and roads that the track stays on inside
+outages. A road is an output: the distance from its middle in units of its half-width, known to be within 1.
 """
 
 from collections.abc import Mapping, Sequence
@@ -82,6 +83,8 @@ class TwoAntennas:
         Estimate altitude and pitch too.
     euler : bool
         Move along the azimuth at the start of each step, as the slides do.
+    rigid : bool
+        Turn the line between the antennas with the vehicle; the slides move both alike.
     nonlinear : bool
         False stops after the linearised model.
     objective, point
@@ -93,6 +96,7 @@ class TwoAntennas:
     roads: Streets | None = None
     height: bool = False
     euler: bool = False
+    rigid: bool = True
     nonlinear: bool = True
     objective: Literal["log", "scaled", "paper"] = "log"
     point: Literal["central", "least_squares", "optimal"] = "optimal"
@@ -165,8 +169,8 @@ def solve(drives: Sequence[Grid], settings: TwoAntennas | None = None) -> list[P
     Returns
     -------
     list of Path
-        ``info`` has, over all outages of a drive, the largest half-widths ``q`` and ``r`` by name, ``on_floor`` (how many
-        outages had which half-width on its floor), ``second`` (T, 2) where there are two antennas, ``altitude`` (T,)
+        ``info`` has, over all outages of a drive, the largest half-widths ``q`` and ``r`` by name, ``on_floor`` (how
+        many outages had which half-width on its floor), ``second`` (T, 2) where there are two antennas, ``altitude`` (T,)
         and ``pitch`` (T,) where asked for, ``notes``.
     """
     settings = TwoAntennas() if settings is None else settings
@@ -181,10 +185,13 @@ def _drive(drive: Grid, settings: TwoAntennas) -> Path:
     if settings.height:
         known = np.zeros(0) if drive.height is None else np.flatnonzero(np.isfinite(drive.height))
         if not len(known):
-            return Path(drive.t, *(columns[k] for k in ("east", "north", "azimuth", "speed")), None, 0.0, Status.STALLED,
-                        {"notes": ["no height to estimate from"]})  # fmt: skip
+            line = columns["east"], columns["north"], columns["azimuth"], columns["speed"]
+            return Path(drive.t, *line, None, 0.0, Status.STALLED, {"notes": ["no height to estimate from"]})
         assert drive.height is not None
-        extra["altitude"], extra["pitch"] = np.interp(drive.t, drive.t[known], drive.height[known]), np.zeros(len(drive))
+        extra["altitude"], extra["pitch"] = (
+            np.interp(drive.t, drive.t[known], drive.height[known]),
+            np.zeros(len(drive)),
+        )
     if drive.second is not None:
         extra["second"] = np.column_stack([_through(drive, p, np.isfinite(p)) for p in drive.second.T])
     status, notes = Status.OK, []
@@ -217,7 +224,9 @@ def _drive(drive: Grid, settings: TwoAntennas) -> Path:
         words = ", ".join(f"{name} in {n}" for name, n in sorted(on_floor.items()))
         notes.append(f"half-widths on their floor, of {len(fits)} outage{'s' if len(fits) > 1 else ''}: {words}")
     info = {"q": q, "r": r, "on_floor": on_floor, "outages": len(fits), "notes": list(dict.fromkeys(notes)), **extra}
-    return Path(drive.t, columns["east"], columns["north"], columns["azimuth"], columns["speed"], None, 0.0, status, info)
+    return Path(
+        drive.t, columns["east"], columns["north"], columns["azimuth"], columns["speed"], None, 0.0, status, info
+    )
 
 
 def _through(drive: Grid, values: Floats, known: Mask | None = None) -> Floats:
@@ -306,7 +315,7 @@ def problem(drive: Grid, settings: TwoAntennas) -> tuple[Nonlinear, Record, Floa
     baseline = _baseline(first, second, phi) if both and second is not None else None
     if second is not None and not both:
         notes.append("the second antenna has no fixes beside the first one's: one antenna")
-    model = _model(drive, settings, baseline, float(np.median(h)))
+    model = _model(drive, settings, baseline)
     # ---- what was measured
     course = drive.course.copy()
     if baseline is not None:
@@ -351,7 +360,7 @@ def problem(drive: Grid, settings: TwoAntennas) -> tuple[Nonlinear, Record, Floa
     return model, Record(drive.t, np.column_stack([y[name] for name in model.names.y])), x, notes
 
 
-def _model(drive: Grid, settings: TwoAntennas, baseline: Floats | None, h: float) -> Nonlinear:
+def _model(drive: Grid, settings: TwoAntennas, baseline: Floats | None) -> Nonlinear:
     """Return the model with its floors, limits and roads."""
     antennas = 1 if baseline is None else 2
     numbers = ("1", "2") if antennas == 2 else ("",)
@@ -387,6 +396,7 @@ def _model(drive: Grid, settings: TwoAntennas, baseline: Floats | None, h: float
             baseline=None if baseline is None else (float(baseline[0]), float(baseline[1])),
             euler=settings.euler,
             antennas=antennas,
+            rigid=settings.rigid,
             heading=antennas == 2,
             height=settings.height,
             acceleration=driven,
@@ -421,11 +431,11 @@ class OnRoads:
 
     def __call__(self, x: Floats) -> Floats:
         """Return the outputs at one state."""
-        return self.rows(x[None])[0][0]
+        return np.asarray(self.rows(x[None])[0][0])
 
     def slope(self, x: Floats) -> Floats:
         """Return their Jacobian at one state."""
-        return self.rows(x[None])[1][0]
+        return np.asarray(self.rows(x[None])[1][0])
 
     def rows(self, x: Floats) -> tuple[Floats, Floats]:
         """Return outputs (n, ny) and Jacobians (n, ny, nx) at states (n, nx)."""
@@ -456,7 +466,8 @@ def _kept(drive: Grid, roads: Streets | None, at: Floats, phi: Floats) -> tuple[
             wanted[seen[left] + 1 : seen[right]] = 0.0
         else:
             notes.append(
-                f"the outage from {drive.t[seen[left]]:.1f} s is not kept on the map: the fixes beside it are off its roads"
+                f"the outage from {drive.t[seen[left]]:.1f} s is not kept on the map:"
+                " the fixes beside it are off its roads"
             )
     return wanted, notes
 

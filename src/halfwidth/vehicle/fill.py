@@ -26,9 +26,8 @@ from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle import calibrate, chain
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.distrust import distrusted
-from halfwidth.vehicle.estimators import COLOURS, METHODS, Method, heading_of, usable
+from halfwidth.vehicle.estimators import COLOURS, METHODS, Method, heading_of, usable, with_limits
 from halfwidth.vehicle.estimators import method as method_of
-from halfwidth.vehicle.estimators import with_limits
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log
@@ -858,6 +857,6 @@ def _altitude(log: Log, t: Floats, paths: Sequence[Path]) -> Floats:
     if paths and all("altitude" in path.info for path in paths):
         at, found = (np.concatenate(parts) for parts in zip(*((p.t, p.info["altitude"]) for p in paths), strict=True))
         order = np.argsort(at, kind="stable")
-        return np.interp(t, at[order], found[order])
+        return np.asarray(np.interp(t, at[order], found[order]))
     clock, height = log.stream("alt_m")
     return np.interp(t, clock, height) if clock.size else np.full(t.size, np.nan)

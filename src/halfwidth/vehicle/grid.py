@@ -125,7 +125,11 @@ _ARRAYS = ("t", "east", "north", "seen", "course", "speed", "yaw_rate", "speed_s
 
 
 def sampled(
-    log: Log, *, clock_offset: float = 0.0, frame: Frame | None = None, sensors: Calibration = AS_LOGGED,
+    log: Log,
+    *,
+    clock_offset: float = 0.0,
+    frame: Frame | None = None,
+    sensors: Calibration = AS_LOGGED,
     second: Log | None = None,
 ) -> Grid:
     """Put a log on one clock.

@@ -132,6 +132,7 @@ def two_antenna(
     baseline: tuple[float, float] | None = None,
     euler: bool = False,
     antennas: int = 2,
+    rigid: bool = False,
     heading: bool = False,
     height: bool = False,
     acceleration: bool = False,
@@ -156,6 +157,9 @@ def two_antenna(
         Move along the azimuth at the start of the step, as the slides do, instead of that in its middle.
     antennas : {1, 2}
         With one antenna the first position only, and no `baseline`.
+    rigid : bool
+        The line between the antennas turns with the vehicle. In the slides both move alike, and what a turn does to
+        the second one is left to the noise.
     heading : bool
         A further output, last but for the altitude: the azimuth state itself, beside that of the line.
     height : bool
@@ -181,6 +185,10 @@ def two_antenna(
         way = dt * x[a + 1] + (0.5 * dt * dt * x[n] if acceleration else 0.0)
         flat = way * np.cos(x[a + 4]) if height else way
         moved = [x[k] + flat * (np.cos(azimuth) if k % 2 else np.sin(azimuth)) for k in range(a)]
+        if rigid and antennas == 2:
+            sin, cos = np.sin(-dt * x[a + 2]), np.cos(-dt * x[a + 2])
+            line = x[2] - x[0], x[3] - x[1]
+            moved[2:] = [moved[0] + line[0] * cos + line[1] * sin, moved[1] - line[0] * sin + line[1] * cos]
         moved += [x[a] - dt * x[a + 2], x[a + 1] + (dt * x[n] if acceleration else 0.0), x[a + 2]]
         moved += [x[a + 3] + way * np.sin(x[a + 4]), x[a + 4]] if height else []
         return np.array(moved + ([x[n]] if acceleration else []))

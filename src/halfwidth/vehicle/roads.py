@@ -193,7 +193,9 @@ def _lines(given: Any, usual: float) -> Iterator[tuple[Any, float]]:
         for line in given.get("coordinates") or ():
             yield line, usual
     elif not isinstance(kind, str):
-        raise BadValue(f"the map is {str(given)[:60]!r}, a GeoJSON object is expected", hint='{"type": "LineString", ...}')
+        raise BadValue(
+            f"the map is {str(given)[:60]!r}, a GeoJSON object is expected", hint='{"type": "LineString", ...}'
+        )
 
 
 def _half_width(feature: dict[str, Any], usual: float) -> float:
