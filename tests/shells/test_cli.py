@@ -469,21 +469,15 @@ def test_a_state_called_like_the_time_is_refused(tmp_path, capsys):
     assert "a state is called 't'" in err
 
 
-def test_fill_on_a_map_within_limits(tmp_path):
-    import halfwidth as hw
-
-    truth, log = hw.vehicle.simulate_drive(duration=60, seed=4, tunnels=[12], fix_noise=0.02, fix_offset=0.05)
-    rows = ["t_s,lat_deg,lon_deg,speed_mps,yaw_rate_radps"]
-    columns = (log.t, log.lat_deg, log.lon_deg, log.speed_mps, log.yaw_rate_radps)
-    rows += [",".join("" if v != v else repr(float(v)) for v in row) for row in zip(*columns, strict=True)]
-    (tmp_path / "drive.csv").write_text("\n".join(rows))
-    line = [[float(x), float(y)] for x, y in zip(truth.lon_deg[::10], truth.lat_deg[::10], strict=True)]
-    (tmp_path / "roads.geojson").write_text(json.dumps({"type": "LineString", "coordinates": line}))
-    found = halfwidth(
-        "fill", "drive.csv", "-o", "track.csv", "--map", "roads.geojson", "--limits", "speed=0:25", "--json", cwd=tmp_path
-    )
-    assert found.returncode == 0, found.stderr
+def test_fill_on_a_map_within_limits(log, tmp_path):
+    with open(log, encoding="utf-8") as file:
+        fixes = [(float(row["lon_deg"]), float(row["lat_deg"])) for row in csv.DictReader(file) if row["lat_deg"]]
+    (tmp_path / "roads.geojson").write_text(json.dumps({"type": "LineString", "coordinates": fixes}))
+    given = ["fill", str(log), "-o", str(tmp_path / "track.csv"), "--map", str(tmp_path / "roads.geojson")]
+    found = done(*given, "--limits", "speed=-1:40,yaw_rate=1", "--json")
+    assert found.returncode == GOOD, found.stderr
     assert json.loads(found.stdout)["method"] == "paper002"
-    wrong = halfwidth("fill", "drive.csv", "-o", "other.csv", "--limits", "speed", cwd=tmp_path)
-    assert wrong.returncode in (2, 3)
-    assert b"NAME=SIZE" in wrong.stderr if isinstance(wrong.stderr, bytes) else "NAME=SIZE" in wrong.stderr
+    wrong = done("fill", str(log), "-o", str(tmp_path / "other.csv"), "--limits", "speed")
+    assert wrong.returncode == BAD
+    assert b"NAME=SIZE" in wrong.stderr
+    assert done(*given, "--force", "--method", "em").returncode == BAD

@@ -27,7 +27,6 @@ logarithmic objective.
 """
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -193,9 +192,13 @@ class SequentialLP:
             status = answer.status
             if not status.good:
                 # a step is judged by the true objective, so it need not be certified, and neither need be the last one
-                if _betters(answer, worth, best):
+                if (
+                    status is Status.STALLED
+                    and _fits(rows, answer.x, answer.theta)
+                    and (worth(answer.x, answer.theta) < best)
+                ):
                     status = Status.REDUCED
-                elif moved and status is not Status.INFEASIBLE:
+                elif status is Status.STALLED and moved and _fits(rows, x, theta):
                     status = Status.REDUCED
                     break
                 else:
@@ -238,10 +241,11 @@ class _At(NamedTuple):
     c: Array
 
 
-def _betters(answer: Answer, worth: Callable[[Array, Array], float], best: float) -> bool:
-    """Whether an answer that is not certified lowers the true objective all the same."""
-    finite = np.isfinite(answer.x).all() and np.isfinite(answer.theta).all()
-    return bool(finite and worth(answer.x, answer.theta) < best)
+def _fits(rows: "Rows", x: Array, theta: Array) -> bool:
+    """Whether a point is finite and its rows lie within their caps."""
+    if not (np.isfinite(x).all() and np.isfinite(theta).all()):
+        return False
+    return bool(np.all(largest(rows.residuals(x, theta), np.zeros(rows.groups)) <= rows.cap * (1.0 + 1e-6)))
 
 
 def _given(start: Any, T: int, nx: int) -> Array:

@@ -170,8 +170,8 @@ def solve(drives: Sequence[Grid], settings: TwoAntennas | None = None) -> list[P
     -------
     list of Path
         ``info`` has, over all outages of a drive, the largest half-widths ``q`` and ``r`` by name, ``on_floor`` (how
-        many outages had which half-width on its floor), ``second`` (T, 2) where there are two antennas, ``altitude`` (T,)
-        and ``pitch`` (T,) where asked for, ``notes``.
+        many outages had which half-width on its floor), ``second`` (T, 2) where there are two antennas,
+        ``altitude`` (T,) and ``pitch`` (T,) where asked for, ``notes``.
     """
     settings = TwoAntennas() if settings is None else settings
     return [_drive(drive, settings) for drive in drives]
