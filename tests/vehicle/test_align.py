@@ -216,7 +216,7 @@ def test_real_logs(name, speed, yaw, data):
     found = calibrated(read(data / f"{name}.csv.gz"))
     assert speed[0] < found.offsets["speed"].seconds < speed[1]
     assert yaw[0] < found.offsets["yaw_rate"].seconds < yaw[1]
-    assert 0.005 < found.offsets["speed"].sd < 0.15
+    assert 0.001 < found.offsets["speed"].sd < 0.15
     assert found.scale == pytest.approx(1, abs=0.03)
     assert abs(found.bias) < 0.005
     assert not found.antenna_observable

@@ -131,6 +131,40 @@ def test_standing_still_all_the_time():
     assert t.size == 300
 
 
+def test_a_jump_of_the_receiver_far_from_a_gap_does_not_bend_it():
+    made = known(160.0, rate=5.0, noise=0.02, speed_noise=0.02, yaw_noise=0.002, seed=4)
+    drive = sampled(made.log)
+    hidden = (drive.t >= 60) & (drive.t <= 90)
+    jumped = dataclasses.replace(drive, east=drive.east + 2.0 * (drive.t > 110))
+    fit = chain.solve([jumped.without(60, 90)])[0]
+    assert int(np.argmin(fit.weight)) == int(np.searchsorted(drive.t, 110, side="right"))
+    assert fit.weight.min() < 0.1
+    assert np.hypot(fit.path.east - drive.east, fit.path.north - drive.north)[hidden].mean() < 0.4
+
+
+def test_a_fix_error_that_drifts_is_carried_into_the_gap():
+    made = known(160.0, rate=5.0, noise=0.02, speed_noise=0.02, yaw_noise=0.002, seed=5)
+    drive = sampled(made.log)
+    # the receiver drifts off by up to 3 m and back, smoothly, again and again
+    drive = dataclasses.replace(drive, north=drive.north + 3.0 * np.sin(2 * np.pi * drive.t / 25.0))
+    off = {}
+    for drifting in (True, False):
+        errors = []
+        for t0 in (40.0, 60.0, 85.0, 110.0):
+            hidden = (drive.t >= t0) & (drive.t <= t0 + 4)
+            path = chain.solve([drive.without(t0, t0 + 4)], chain.Chain(drifting=drifting))[0].path
+            errors.append(np.hypot(path.east - drive.east, path.north - drive.north)[hidden].mean())
+        off[drifting] = np.mean(errors)
+    assert off[True] < 0.7 * off[False]
+
+
+def test_fixes_wrong_by_white_noise_only_have_no_offset():
+    drive = sampled(noisy(duration=60.0, offset=0.0).log).without(20, 30)
+    fit = chain.solve([drive], chain.Chain(slow=False))[0]
+    assert np.abs(fit.z[:, [chain.OFFSET_E, chain.OFFSET_N]]).max() < 1e-2
+    assert fit.path.info["slow_sd"] == 0.0
+
+
 def test_a_first_azimuth_points_along_the_way():
     made = noisy(duration=100.0, bias=0.01)
     drive = sampled(made.log).without(40, 70)

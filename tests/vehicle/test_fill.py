@@ -336,7 +336,7 @@ def test_two_stray_fixes_do_not_set_the_noise_of_the_drive(jump):
     lat[700:702] += jump / 111e3
     clean = fill(made.log.without(100, 115))
     track = sound(fill(dataclasses.replace(made.log, lat_deg=lat).without(100, 115)))
-    assert any("left out: t = 70.0, 70.1 s" in m or "left out: t = 70.0 s" in m for m in track.messages)
+    assert any("left out: 70.0" in m or "left out: t = 70.0" in m for m in track.messages)
     # 5 Hz nodes: the second fix may not be looked at at all
     off = made.error(track.t_s, track.lat_deg, track.lon_deg)
     assert off.max() < 2.0
@@ -447,7 +447,7 @@ def test_without_a_yaw_rate_one_gap_is_judged_by_others_that_do_not_know_the_way
         error, half, inside = _against_hidden(log, track, [(a, a + 30)])
         shares.append(inside)
         assert error.max() < 5 * half.max()
-    assert np.mean(shares) > 0.85
+    assert np.mean(shares) > 0.75  # five gaps: 0.9 with a standard error of about 0.1
 
 
 def test_silent_sensors_in_one_gap_do_not_widen_the_others():

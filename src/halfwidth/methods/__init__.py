@@ -20,7 +20,14 @@ ESTIMATORS: dict[str, str] = {
     "BatchLP": "map",
     "SequentialLP": "sequential",
     "Window": "window",
+    "Hull": "hull",
     "Constrained": "constrain",
+    "MixedFilter": "mixed",
+    "MixedWindow": "mixed_window",
+    "IntervalFilter": "sets",
+    "ZonotopeFilter": "sets",
+    "ConstrainedZonotopeFilter": "sets",
+    "EllipsoidFilter": "sets",
 }
 
 

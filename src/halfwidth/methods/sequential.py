@@ -157,23 +157,24 @@ class SequentialLP:
         rows = rows_of(model, record, self.drift)
         theta = start_theta(rows, self.theta)
         x = rows.start(theta) if self.start is None else _given(self.start, len(record), rows.nx)
-        at = _At(x, theta, None, Status.STALLED, [], np.ones(rows.groups))
+        c = np.ones(rows.groups) if self.objective == "paper" else rows.weights(x, theta)
+        return finished(self, model, record, rows, self.descend(rows, x, theta, c))
+
+    def descend(self, rows: "Rows", x: Array, theta: Array, c: Array) -> "Descent":
+        """Follow linearisations from (x, theta) as long as they lower the true objective; go to the point asked for."""
         log = self.objective == "log"
+        at = Descent(x, theta, Status.STALLED, None, [], c)
         # the logarithm is concave: where it ends depends on where it starts
-        if self.objective != "paper":
-            at = at._replace(c=rows.weights(x, theta))
         at = self._descended(rows, at, "optimal" if log or self.point == "least_squares" else self.point)
         if log and at.status.good:
             at = self._descended(rows, at, "optimal", log=True)
         if at.status.good and self.point == "least_squares":
-            at = _squared(rows, at)
-        elif at.status.good and log and self.point == "central":
-            at = _centred(rows, at)
-        return finished(self, model, record, rows, at)
+            return _squared(rows, at)
+        return _centred(rows, at) if at.status.good and log and self.point == "central" else at
 
-    def _descended(self, rows: "Rows", at: "_At", point: Any, *, log: bool = False) -> "_At":
+    def _descended(self, rows: "Rows", at: "Descent", point: Any, *, log: bool = False) -> "Descent":
         """Lower one objective, program by program, about the newest point."""
-        x, theta, answer, status, history, c = at
+        x, theta, status, answer, history, c = at
 
         def worth(x: Array, theta: Array) -> float:
             return rows.log_worth(x, theta) if log else rows.worth(x, theta, c)
@@ -227,16 +228,16 @@ class SequentialLP:
             if abs(gain) <= self.tol * (1.0 if log else max(abs(value), 1e-300)) and not first:
                 break
             first = False
-        return _At(x, theta, answer, status, history, c)
+        return Descent(x, theta, status, answer, history, c)
 
 
-class _At(NamedTuple):
-    """Where a descent stands: states, theta, the last program's answer, how it went, the objective's course, costs."""
+class Descent(NamedTuple):
+    """Where linearisations led: states, theta, how the last program went, its answer, the objective's course, costs."""
 
     x: Array
     theta: Array
-    answer: Answer | None
     status: Status
+    answer: Answer | None
     history: list[float]
     c: Array
 
@@ -285,7 +286,7 @@ def _restored(rows: "Rows", x: Array, theta: Array, rounds: int) -> tuple[Array,
     return x, theta, over <= _NONE
 
 
-def _centred(rows: "Rows", at: "_At") -> "_At":
+def _centred(rows: "Rows", at: "Descent") -> "Descent":
     """Move to the central point of the last program, where states are estimated best."""
     answer = solve(rows.chain(at.x, at.theta, at.c), point="central", fallback=False)
     if answer.status is not Status.OK:
@@ -293,7 +294,7 @@ def _centred(rows: "Rows", at: "_At") -> "_At":
     return at._replace(x=answer.x, theta=answer.theta, answer=answer)
 
 
-def _squared(rows: "Rows", at: "_At") -> "_At":
+def _squared(rows: "Rows", at: "Descent") -> "Descent":
     """Move to the least squares of the rows inside the half-widths of this point."""
     s = largest(rows.residuals(at.x, at.theta), rows.floor)
     found = squares(rows.chain(at.x, at.theta, at.c), s)
@@ -645,6 +646,33 @@ def rows_of(model: Model, record: Record, drift: float | None = None) -> Rows:
     return LinearRows(model, record, drift) if isinstance(model, Linear) else NonlinearRows(model, record)
 
 
+def expected(model: Model, record: Record, k: int, x: Array) -> Array:
+    """Return the states of row k, (n, nx), that a model without unknown entries expects after x, (n, nx)."""
+    u = None if record.u is None else record.u[k]
+    dt = float(record.t[k] - record.t[k - 1]) if k else model.dt
+    if not isinstance(model, Linear):
+        return np.array([model.move(one, u, dt) for one in x], dtype=np.float64).reshape(x.shape)
+    t = float(record.t[k])
+    moved = x @ model.A.at(t, dt, k).T
+    if model.B is not None and u is not None:
+        moved = moved + model.B.at(t, dt, k) @ u
+    return np.asarray(moved if model.E is None else np.linalg.solve(model.E.at(t, dt, k), moved.T).T, dtype=np.float64)
+
+
+def growth(model: Model, record: Record, k: int, x: Array, half: Array, q: Array) -> Array:
+    """Return how far a state within `half` of x may be from what is expected at row k, if its noise keeps within q."""
+    dt = float(record.t[k] - record.t[k - 1]) if k else model.dt
+    if not isinstance(model, Linear):
+        u = None if record.u is None else record.u[k]
+        return np.asarray(np.abs(model.linearise(x, u, dt).g_x) @ half + q)
+    t = float(record.t[k])
+    A = model.A.at(t, dt, k)
+    if model.E is None:
+        return np.asarray(np.abs(A) @ half + q)
+    left = np.linalg.inv(model.E.at(t, dt, k))
+    return np.asarray(np.abs(left @ A) @ half + np.abs(left) @ q)
+
+
 def filled(model: Linear, theta: Array) -> Linear:
     """Return the model with its unknown entries set to theta."""
     entries = model.theta_entries
@@ -697,9 +725,9 @@ def chain_residuals(chain: Chain, x: Array) -> Array:
     return np.hstack([w, e])
 
 
-def finished(method: SequentialLP, model: Model, record: Record, rows: Rows, at: _At) -> Estimate:
+def finished(method: SequentialLP, model: Model, record: Record, rows: Rows, at: Descent) -> Estimate:
     """Return the estimate at a point."""
-    x, theta, answer, status, history, c = at
+    x, theta, status, answer, history, c = at
     rho = rows.residuals(x, theta)
     s = largest(rho, rows.floor)
     over = s > rows.cap * (1.0 + 1e-6)

@@ -12,7 +12,7 @@ from typing import Any
 from halfwidth.errors import BadValue
 
 #: Papers that are reproduced here, by number.
-PAPERS: dict[str, str] = {"000": "paper000", "001": "paper001", "002": "paper002", "003": "paper003"}
+PAPERS: dict[str, str] = {"000": "paper000", "001": "paper001", "002": "paper002", "003": "paper003", "004": "paper004"}
 
 #: Those whose experiments can also be run on a vehicle's logs.
 ON_LOGS = ("000", "002")

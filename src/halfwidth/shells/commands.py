@@ -420,7 +420,7 @@ def doctor(json_: Json = False) -> int:
 
 @app.command(epilog="Example: halfwidth reproduce 003 --quick")
 def reproduce(
-    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000, 001, 002 or 003.")],
+    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000 to 004.")],
     logs: Annotated[
         list[str] | None, typer.Argument(metavar="LOG...", help="Logs of drives to run papers 000 and 002 on as well.")
     ] = None,

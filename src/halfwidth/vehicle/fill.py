@@ -1,16 +1,18 @@
 """Fill a drive: a position with a half-width for every row of a log that had, or could have had, a fix.
 
 The log is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
-gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened by what
-hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate too are tested by
-hiding these as well, and bridged by constant velocity where hidden fixes show that to be better. A method that fails on
-a piece is replaced by a simpler one there, and the track says so.
+gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened or
+narrowed by what hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate
+too are tested by hiding these as well, and bridged by constant velocity where hidden fixes show that to be better;
+where they speak, the chain whose fixes are wrong by white noise only competes in the same way. A method that fails on a
+piece is replaced by a simpler one there, and the track says so.
 
-Positions are those that the receiver would have reported. What it is wrong by for minutes at a time is in the fixes on
-both sides of a gap and in the filling between them, and hiding fixes cannot show it. The chain learns how large that
-slow error is (its fix offset), and the half-widths have it added:
+Positions are those that the receiver would have reported, and the half-widths say how far off they are: hidden fixes
+lie within them as often as `level` says, on this log. What the receiver is wrong by for minutes at a time is in the
+fixes on both sides of a gap and in the filling between them, and hiding fixes cannot show it; the chain learns how
+large that slow error is (its fix offset), and the messages name it.
 
-    half = z sqrt(inflation^2 (variance of the path + variance of a fix) + variance of the slow error)
+    half = z inflation sqrt(variance of the path + variance of a fix)
 """
 
 import os
@@ -482,10 +484,10 @@ def _estimated(
         mine = []
         for span in inner:
             by = _nearest(tests, chosen.name, span.length)
-            mine.append(_Bridge(span, by, tuple(tests.get(by, ())), 0.0))
+            mine.append(_Bridge(span, by, tuple(tests.get(by, [])), 0.0))
         for span in outer:
             # without a test of its own, an end is at least as uncertain as a model says
-            own_test = ends or tests.get(chosen.name, ())
+            own_test = ends or tests.get(chosen.name, [])
             mine.append(_Bridge(span, chosen.name, tuple(own_test), 0.0 if ends else 1.0))
         bridges += mine
         messages.extend(_choice_words(tests, mine))

@@ -39,11 +39,14 @@ FAR, FAR_M, NEAR, AGREED = 4.0, 0.5, 2.0, 0.15
 JUMP, JUMP_M = 8.0, 1.0
 
 #: Doubts that are looked into at most, in one drive; how often, as what fades is seen bit by bit; rounds of the chain.
-_MOST, _LOOKS, _ROUNDS = 150, 3, 5
+_MOST, _LOOKS, _ROUNDS = 150, 4, 5
+
+#: Share of what is unusual that is enough for fixes that follow wrong ones: a fault that came fades.
+_AGAIN = 0.5
 
 #: Places where nobody doubts that show what is usual: about so many, and at least; the quantile of how far they are off
 #: that counts, and how many times that a stray fix is off; how many times `FAR` where there are too few such places.
-_CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 2.0, 2.0
+_CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 1.6, 2.0
 
 #: Scale of what the calibration takes to be without noise.
 _NO_NOISE = 1e-4
@@ -129,8 +132,8 @@ def strays(grid: Grid, sensors: Calibration) -> Strays:
     search = _Search(grid, np.flatnonzero(grid.seen), settings, noise)
     gaps, jumps = _gaps(grid, search.seen), _jumps(grid, search.seen)
     doubts = gaps[:_MOST]
-    for _ in range(_LOOKS):
-        doubts = search.look(doubts)
+    for k in range(_LOOKS):
+        doubts = search.look(doubts, 1.0 if k == 0 else _AGAIN)
     # what a stray stretch begins or ends with is a jump, too
     near = np.convolve(search.gone[search.seen], np.ones(3), mode="same") > 0
     search.look([doubt for doubt in jumps if not near[doubt.first]][:_MOST])
@@ -169,6 +172,7 @@ class _Wrong:
     """Fixes that are wrong by what was said about one doubt."""
 
     clear: float  # how many standard deviations the furthest is off
+    doubted: NDArray[np.intp]
     nodes: NDArray[np.intp]
     distance: Floats
 
@@ -182,19 +186,22 @@ class _Search:
         self.gone = np.zeros(len(grid), dtype=bool)
         self._usual: dict[tuple[bool, bool, float], float] = {}
 
-    def look(self, doubts: Sequence[_Doubt]) -> list[_Doubt]:
-        """Find which of the doubtful fixes are wrong; return the doubts that had some, moved on to the next fix."""
+    def look(self, doubts: Sequence[_Doubt], share: float = 1.0) -> list[_Doubt]:
+        """Find which of the doubtful fixes are wrong; return the doubts that had some, moved on to the next fix.
+
+        A share of what is unusual is enough after fixes that were wrong.
+        """
         clearest: dict[_Doubt, _Wrong] = {}
         for answer in self._ask(doubts, DOUBTED):
             doubt, nodes = answer.doubt, answer.nodes
-            if not _wrong(answer, 1.0).any():
+            if not _wrong(answer, share).any():
                 continue
-            wrong = _wrong(answer, self._unusual(doubt, answer.length)) & ~self.gone[nodes]
+            wrong = _wrong(answer, share * self._unusual(doubt, answer.length)) & ~self.gone[nodes]
             if wrong.any():
                 distance, sd = answer.off[-1]
                 clear = float((distance / sd)[wrong].max())
                 if doubt not in clearest or clear > clearest[doubt].clear:
-                    clearest[doubt] = _Wrong(clear, nodes[wrong], distance[wrong])
+                    clearest[doubt] = _Wrong(clear, nodes, nodes[wrong], distance[wrong])
         left = []
         for doubt, stray in self._confirmed(clearest).items():
             self.size[stray.nodes], self.gone[stray.nodes] = stray.distance, True
@@ -239,7 +246,7 @@ class _Search:
         hidden, parts = [], []
         for doubt, wrong in found.items():
             mask = self.gone.copy()
-            mask[wrong.nodes] = True
+            mask[wrong.doubted] = True
             here = t[doubt.first]
             back, ahead = (AROUND, AROUND + DOUBTED[-1]) if doubt.after else (AROUND + DOUBTED[-1], AROUND)
             start = np.searchsorted(t, min(here, t[max(doubt.block[0] - 1, 0)]) - back)
