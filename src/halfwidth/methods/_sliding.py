@@ -251,14 +251,14 @@ class Sliding:
         rows: Any = rows_of(model, part, method.drift)
         x, theta = np.array(self.x[a:]), self.theta
         c = np.ones(rows.groups)
-        if isinstance(model, Nonlinear):
+        if isinstance(model, Nonlinear) or method.objective == "log" or method.point == "least_squares":
             early = self.pushed <= self.window.memory
             x = rows.start(theta) if early else x
-            if method.objective == "scaled":
+            if method.objective != "paper":
                 c = rows.weights(x, theta) if self.costs is None else self.costs
                 self.costs = None if early else c
             step = method.descend(rows, x, theta, c)
-            x, theta, status, answer, _ = step
+            x, theta, status, answer = step[:4]
             count = 0 if answer is None else answer.iterations
         else:
             if method.objective == "scaled":

@@ -127,6 +127,20 @@ def fill(
     method: Annotated[str | None, typer.Option(metavar="NAME", help="Estimator; the default needs no tuning.")] = None,
     level: Level = 0.9,
     clock_offset: ClockOffset = None,
+    second: Annotated[
+        str | None, typer.Option(metavar="LOG", help="Fixes of a second antenna on the same clock (method paper002).")
+    ] = None,
+    map_: Annotated[
+        str | None, typer.Option("--map", metavar="GEOJSON", help="Roads that gaps are kept on (method paper002).")
+    ] = None,
+    limits: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME=MOST,...",
+            help="Limits of speed, acceleration, yaw_rate, altitude, pitch (method paper002):"
+            " speed=0:30,acceleration=4,yaw_rate=0.8 in m/s, m/s^2, rad/s, m, rad.",
+        ),
+    ] = None,
     columns: Columns = None,
     json_: Json = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Read and check everything, write nothing.")] = False,
@@ -156,7 +170,13 @@ def fill(
         _writable(path, log, force)
     if output is not None:
         _ending_known(output, format_)
-    job = Job("fill", log, method=method, level=level, settings={"clock_offset": clock_offset},
+    settings: dict[str, Any] = {"clock_offset": clock_offset}
+    settings |= {name: value for name, value in (("second", second), ("roads", map_)) if value is not None}
+    if limits is not None:
+        from halfwidth.vehicle.antennas import parsed_limits
+
+        settings["limits"] = parsed_limits(limits)
+    job = Job("fill", log, method=method, level=level, settings=settings,
               columns=parse_columns(columns or ""))  # fmt: skip
     if dry_run:
         found = read(log, columns=job.columns)
@@ -400,7 +420,10 @@ def doctor(json_: Json = False) -> int:
 
 @app.command(epilog="Example: halfwidth reproduce 003 --quick")
 def reproduce(
-    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000, 001, 003 or 004.")],
+    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000 to 004.")],
+    logs: Annotated[
+        list[str] | None, typer.Argument(metavar="LOG...", help="Logs of drives to run papers 000 and 002 on as well.")
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A small part of each experiment.")] = False,
     json_: Json = False,
 ) -> int:
@@ -410,7 +433,9 @@ def reproduce(
     if paper not in papers.PAPERS:
         known = ", ".join(papers.PAPERS)
         raise _usage(f"`{paper}` is no paper that is reproduced here, one of {known} is expected", "reproduce 003")
-    found = papers.tables(paper, quick=quick)
+    if logs and paper not in papers.ON_LOGS:
+        raise _usage(f"paper {paper} is not about vehicles, a log has no use", f"reproduce {papers.ON_LOGS[-1]} LOG")
+    found = papers.tables(paper, quick=quick, logs=logs or ())
     if json_:
         tables = [
             {"title": t.title, "header": list(t.header), "rows": [list(r) for r in t.rows], "notes": list(t.notes)}
