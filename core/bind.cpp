@@ -12,6 +12,7 @@ void bind_loss(nb::module_& m);
 void bind_lp(nb::module_& m);
 void bind_chain(nb::module_& m);
 void bind_noise(nb::module_& m);
+void bind_ep(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -26,4 +27,5 @@ NB_MODULE(_core, m) {
     bind_lp(m);
     bind_chain(m);
     bind_noise(m);
+    bind_ep(m);
 }
