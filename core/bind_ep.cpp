@@ -142,6 +142,8 @@ nb::dict run(In s, In b, In A, std::optional<InInt> A_index, std::optional<In> G
     nb::dict found;
     found["x"] = fresh({members, T + 1, n}, &a.x);
     found["P"] = fresh({members, T + 1, n, n}, &a.P);
+    found["k3"] = fresh({members, T + 1, n}, &a.k3);
+    found["k4"] = fresh({members, T + 1, n}, &a.k4);
     found["log_z"] = fresh({members}, &a.log_z);
     found["slope"] = fresh({members, groups + 1}, &a.slope);
     found["residual"] = fresh({members}, &a.residual);

@@ -7,13 +7,14 @@ namespace {
 
 std::size_t block_size(const EpArgs& a) {
     const std::size_t stages = a.T + 1, n = a.n;
-    return stages * (2 * n + n * (n + 1)) + stages * 2 * n + 2 * std::size_t(a.rows) + 3 * std::size_t(a.groups) + 4;
+    const std::size_t shape = a.k3 ? stages * (5 * n * n + 2 * n) + 2 * std::size_t(a.rows) : 0;
+    return stages * (2 * n + n * (n + 1)) + stages * 2 * n + 2 * std::size_t(a.rows) + 3 * std::size_t(a.groups) + 4 + shape;
 }
 
 template <class N>
 int run(N n, const EpArgs& a) {
     for (int first = 0; first < a.members; first += lanes) {
-        Ep<N> ep{n, a, {first, a.members - 1}, {}};
+        Ep<N> ep{n, a, {first, a.members - 1}, {}, {}};
         const std::ptrdiff_t stages = a.T + 1, tri = n * (n + 1) / 2;
         V* p = reinterpret_cast<V*>(a.work);
         const auto take = [&p](std::ptrdiff_t size) {
@@ -33,6 +34,21 @@ int run(N n, const EpArgs& a) {
         s.s = take(a.groups + 1);
         EpFound f{};
         f.slope = take(a.groups + 1);
+        if (a.k3) {
+            EpCross& c = ep.cross;
+            const std::ptrdiff_t square = stages * n * n;
+            c.S = take(square);
+            c.Pf = take(square);
+            c.B = take(square);
+            c.X0 = take(square);
+            c.X1 = take(square);
+            c.w3 = take(stages * n);
+            c.w4 = take(stages * n);
+            c.r3 = take(a.rows);
+            c.r4 = take(a.rows);
+        }
+        const EpCross wanted = ep.cross;
+        ep.cross = EpCross{};
         const auto member = [&](int l) { return first + l < a.members ? first + l : a.members - 1; };
         for (int l = 0; l < lanes; l++) {
             for (int g = 0; g < a.groups; g++) s.s[g].set(l, a.s[std::ptrdiff_t(member(l)) * a.groups + g]);
@@ -64,7 +80,9 @@ int run(N n, const EpArgs& a) {
             used++;
             if (max_lanes(f.residual) < a.tol) break;
         }
+        ep.cross = wanted;
         ep.look(f);
+        if (a.k3) ep.shapes(a.k3, a.k4);
         for (int l = 0; l < lanes && first + l < a.members; l++) {
             const std::ptrdiff_t k = first + l;
             a.log_z[k] = f.log_z[l];

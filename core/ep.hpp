@@ -127,7 +127,16 @@ struct EpFound {
     V residual;   // largest distance of a site's moments from the belief's, in standard deviations
     V log_z;      // evidence
     V* slope;     // (groups + 1,): d log Z / d log s, d log Z / d logit eps
-    V worst;      // smallest log Z of a site, per site
+    V worst;      // smallest log Z of a site
+};
+
+// What the shapes of the beliefs need, filled by `look`; null pointers: not wanted.
+struct EpCross {
+    V *S, *Pf;  // (T+1, n, n): covariance of x_t given all, and given what lies up to t
+    V *B;       // (T+1, n, n): covariance of x_{t-1} with x_t
+    V *X0, *X1; // (T+1, n, n): covariance of x_{t-1} and of x_t with w_t
+    V *w3, *w4; // (T+1, n): cumulants of the sites of w over the variance's powers 3 and 4
+    V *r3, *r4; // (rows,): of the rows
 };
 
 template <class N>
@@ -137,6 +146,7 @@ struct Ep {
     const EpArgs& a;
     EpBlock block;
     EpState s;
+    EpCross cross;
 
     inline int packed() const { return n * (n + 1) / 2; }
     inline void unpack(const V* p, V* M) const {
@@ -300,7 +310,10 @@ struct Ep {
         for (int k = a.start[t]; k < a.start[t + 1]; k++) {
             const bool fixed = kind(k) == noise_gaussian;
             if (fixed) {
-                if constexpr (!renew) f.log_z -= V(0.5) * V(log_2pi + std::log(a.R[k]));
+                if constexpr (!renew) {
+                    f.log_z -= V(0.5) * V(log_2pi + std::log(a.R[k]));
+                    if (cross.S) cross.r3[k] = cross.r4[k] = V(0.0);
+                }
                 continue;
             }
             V h[cap], Ph[cap];
@@ -342,6 +355,7 @@ struct Ep {
                 f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], mu, c);
                 f.worst = smaller(f.worst, of(q.log_z));
                 slopes(k, q, f);
+                if (cross.S) ratios(shape(k, mu, c), v, cross.r3 + k, cross.r4 + k);
                 if (a.out) {
                     for (int l = 0; l < lanes && block.first + l <= block.last; l++)
                         a.out[static_cast<std::ptrdiff_t>(block.first + l) * a.rows + k] = q.out[l];
@@ -406,7 +420,11 @@ struct Ep {
                     ms[i] = mp[i];
                     for (int j = 0; j < n; j++) ms[i] += Ps[i * n + j] * eta[j];
                 }
-                if constexpr (!renew) give(t, ms, Ps);
+                if constexpr (!renew) {
+                    give(t, ms, Ps);
+                    if (cross.S)
+                        for (int i = 0; i < n * n; i++) cross.S[t * n * n + i] = Ps[i];
+                }
                 rows<renew>(t, ms, Ps, f, damping);
             }
             // filtered: the rows of t folded in one after the other
@@ -432,6 +450,8 @@ struct Ep {
                     for (int j = 0; j < n; j++) Pf[i * n + j] -= g * Ph[j];
                 }
             }
+            if (!renew && cross.S)
+                for (int i = 0; i < n * n; i++) cross.Pf[t * n * n + i] = Pf[i];
         }
     }
 
@@ -455,6 +475,7 @@ struct Ep {
                 for (int j = 0; j < n; j++) gap[i] -= Lambda[i * n + j] * s.mp[t * n + j];
             }
             less(W, Pp, gap, r);
+            if (!renew && cross.S) covariances(t, A, G, W, Pp);
             if (t > 0 && a.G.data) turn(G, W, r);
             sites<renew>(t, W, r, f);
             if (t == 0) break;
@@ -483,6 +504,173 @@ struct Ep {
                 }
             }
         }
+    }
+
+    // covariances of x_{t-1}, x_t and w_t, given W before it is turned by G
+    inline void covariances(int t, const V* A, const V* G, const V* W, const V* Pp) const {
+        V *B = cross.B + t * n * n, *X0 = cross.X0 + t * n * n, *X1 = cross.X1 + t * n * n;
+        const V* D = s.D + t * n;
+        V WG[cap * cap], left[cap * cap], PA[cap * cap];
+        for (int i = 0; i < n; i++)  // W G D and (I - P W) G D
+            for (int j = 0; j < n; j++) {
+                V q = W[i * n + j];
+                if (t > 0 && a.G.data) {
+                    q = V(0.0);
+                    for (int k = 0; k < n; k++) q += W[i * n + k] * G[k * n + j];
+                }
+                WG[i * n + j] = q * D[j];
+            }
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q = t > 0 && a.G.data ? G[i * n + j] * D[j] : i == j ? D[j] : V(0.0);
+                V p(i == j ? 1.0 : 0.0);
+                for (int k = 0; k < n; k++) {
+                    q -= Pp[i * n + k] * WG[k * n + j];
+                    p -= W[i * n + k] * Pp[k * n + j];
+                }
+                X1[i * n + j] = q;
+                left[i * n + j] = p;  // I - W P
+            }
+        if (t == 0) return;
+        const V* Pf = cross.Pf + (t - 1) * n * n;
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0);
+                for (int k = 0; k < n; k++) q += Pf[i * n + k] * A[j * n + k];
+                PA[i * n + j] = q;
+            }
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0), p(0.0);
+                for (int k = 0; k < n; k++) {
+                    q -= PA[i * n + k] * WG[k * n + j];
+                    p += PA[i * n + k] * left[k * n + j];
+                }
+                X0[i * n + j] = q;
+                B[i * n + j] = p;
+            }
+    }
+
+    // Third and fourth cumulants of the states, to first order in what the sites leave out: a factor whose tilted
+    // distribution has the cumulant k_r adds (Cov(x, z) / Var(z))^r k_r. Factors more than `reach` rows away count as
+    // Gaussian: they add with the r-th power of a small correlation.
+    void shapes(double* k3, double* k4) const {
+        constexpr int reach = 4;
+        for (int t = 0; t <= a.T; t++) {
+            V c3[cap], c4[cap], R[cap * cap], M[cap * cap];
+            for (int i = 0; i < n; i++) c3[i] = c4[i] = V(0.0);
+            const V* S = cross.S + t * n * n;
+            rows_shape(t, S, c3, c4);
+            noise_shape(t, cross.X1 + t * n * n, c3, c4);
+            for (int side = 0; side < 2; side++) {
+                for (int i = 0; i < n * n; i++) {
+                    R[i] = S[i];
+                    M[i] = V(i % (n + 1) == 0 ? 1.0 : 0.0);
+                }
+                for (int l = 1; l <= reach; l++) {
+                    const int u = side == 0 ? t + l : t - l;
+                    if (u < 0 || u > a.T) break;
+                    if (l > 1) gain(R, side == 0 ? u - 1 : u + 1, M);  // Cov(x_t, x_v) Cov(x_v)^-1, v next to u
+                    if (side == 0) {
+                        V C[cap * cap];
+                        product(M, cross.X0 + u * n * n, C);
+                        noise_shape(u, C, c3, c4);
+                        product(M, cross.B + u * n * n, R);
+                    } else {
+                        product_t(M, cross.B + (u + 1) * n * n, R);
+                        V K[cap * cap], C[cap * cap];
+                        gain(R, u, K);
+                        product(K, cross.X1 + u * n * n, C);
+                        noise_shape(u, C, c3, c4);
+                    }
+                    rows_shape(u, R, c3, c4);
+                }
+            }
+            for (int l = 0; l < lanes && block.first + l <= block.last; l++) {
+                const std::ptrdiff_t at = (static_cast<std::ptrdiff_t>(block.first + l) * (a.T + 1) + t) * n;
+                for (int i = 0; i < n; i++) {
+                    const double v = max2(S[i * n + i][l], 1e-300), sd = std::sqrt(v);
+                    k3[at + i] = c3[i][l] / (v * sd);
+                    k4[at + i] = c4[i][l] / (v * v);
+                }
+            }
+        }
+    }
+
+    // covariance R (n,n) of x_t with x_u: what the rows and the noise of u add
+    inline void rows_shape(int u, const V* R, V* c3, V* c4) const {
+        for (int k = a.start[u]; k < a.start[u + 1]; k++) {
+            if (kind(k) == noise_gaussian) continue;
+            V h[cap];
+            row(k, h);
+            for (int i = 0; i < n; i++) {
+                V q(0.0);
+                for (int j = 0; j < n; j++) q += R[i * n + j] * h[j];
+                c3[i] += q * q * q * cross.r3[k];
+                c4[i] += q * q * q * q * cross.r4[k];
+            }
+        }
+    }
+    inline void noise_shape(int u, const V* C, V* c3, V* c4) const {
+        for (int j = 0; j < n; j++)
+            for (int i = 0; i < n; i++) {
+                const V q = C[i * n + j];
+                c3[i] += q * q * q * cross.w3[u * n + j];
+                c4[i] += q * q * q * q * cross.w4[u * n + j];
+            }
+    }
+    inline void product(const V* M, const V* B, V* out) const {
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0);
+                for (int k = 0; k < n; k++) q += M[i * n + k] * B[k * n + j];
+                out[i * n + j] = q;
+            }
+    }
+    inline void product_t(const V* M, const V* B, V* out) const {
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0);
+                for (int k = 0; k < n; k++) q += M[i * n + k] * B[j * n + k];
+                out[i * n + j] = q;
+            }
+    }
+    // M = R S_v^-1
+    inline void gain(const V* R, int v, V* M) const {
+        V L[cap * cap], work[cap];
+        for (int i = 0; i < n * n; i++) {
+            L[i] = cross.S[v * n * n + i];
+            M[i] = R[i];
+        }
+        unit_factor(n, L, 1e-12, work);
+        for (int i = 0; i < n; i++) {
+            V* b = M + i * n;
+            unit_lower(n, L, b);
+            for (int j = 0; j < n; j++) b[j] = b[j] * L[j * n + j];
+            unit_upper(n, L, b);
+        }
+    }
+
+    inline Shape4 shape(int k, const V& mu, const V& c) const {
+        const V4 half = a.group[k] >= 0 ? s.s[a.group[k]].v : V4{};
+        if (kind(k) == ep_truncation) return truncated_shape4(mu.v, c.v, all4(a.lo[k]), all4(a.hi[k]));
+        if (kind(k) == noise_uniform) return truncated_shape4(mu.v, c.v, -half, half);
+        const V4 R = variance(k).v;
+        const Shape4 f = uniform_gaussian_shape4(mu.v, c.v, half, R);
+        if (kind(k) == noise_uniform_gaussian) return f;
+        const V4 p = tilted(k, mu, c).out;
+        if (kind(k) == noise_contaminated)
+            return mixture_shape4(f, gaussian_shape4(mu.v, c.v, R + a.wide * a.wide * half * half), p);
+        Shape4 g{};
+        g.mean = mu.v;
+        g.m2 = c.v;
+        g.m4 = 3.0 * c.v * c.v;
+        return mixture_shape4(f, g, p);
+    }
+    static inline void ratios(const Shape4& q, const V& v, V* out3, V* out4) {
+        const V w = V(1.0) / larger(v, V(1e-60));
+        *out3 = of(q.k3()) * w * w * w;
+        *out4 = of(q.k4()) * w * w * w * w;
     }
 
     // r = (I - W P) g = (I + Lambda P)^-1 g
@@ -526,7 +714,10 @@ struct Ep {
     inline void sites(int t, V* W, V* r, EpFound& f) {
         V *m = s.m + t * n, *D = s.D + t * n;
         for (int i = 0; i < n; i++) {
-            if (!has_site(t, i)) continue;
+            if (!has_site(t, i)) {
+                if (!renew && cross.S) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
+                continue;
+            }
             const V half = larger(width(t, i), V(1e-150));
             const V know = larger(W[i * n + i], V(1e-8) / (half * half));  // nothing known: a wide cavity
             const V c = larger(V(1.0) / know - D[i], V(1e-12) * D[i]), mu = m[i] + r[i] / know;
@@ -551,6 +742,9 @@ struct Ep {
                 f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + of(log4(spread.v)) + d * d / spread);
                 f.worst = smaller(f.worst, of(q.log_z));
                 if (t > 0) f.slope[a.group_w[i]] += of(q.slope_s);
+                if (cross.S)
+                    ratios(truncated_shape4(mu.v, c.v, -half.v, half.v), D[i] * (V(1.0) - D[i] * know),
+                           cross.w3 + t * n + i, cross.w4 + t * n + i);
             }
         }
     }

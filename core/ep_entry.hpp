@@ -46,6 +46,7 @@ struct EpArgs {
     double damping;    // of sites that may widen a belief
     // found
     double *x, *P;                 // (members,T+1,n), (members,T+1,n,n)
+    double *k3, *k4;               // (members,T+1,n): standardised cumulants of the states; or null
     double *log_z, *slope;         // (members,), (members,groups+1)
     double *residual, *worst;      // (members,)
     double* out;                   // (members,rows) probability that a row is an outlier or lost; or null

@@ -176,6 +176,84 @@ inline Truncated4 truncated4(V4 mu, V4 c, V4 lo, V4 hi) {
     return r;
 }
 
+// Third and fourth cumulant of a tilted distribution, and its central moments.
+struct Shape4 {
+    V4 mean, m2, m3, m4;
+    inline V4 k3() const { return m3; }
+    inline V4 k4() const { return m4 - 3.0 * m2 * m2; }
+};
+
+// of N(mu, c) cut to [lo, hi], by quadrature over the part that carries mass; about six digits
+inline Shape4 truncated_shape4(V4 mu, V4 c, V4 lo, V4 hi) {
+    constexpr double node[10] = {0.4965642995925475, 0.4819859636389569, 0.456117214125663, 0.4195584859111094,
+                                   0.3731659532300754, 0.3180268403632575, 0.25543350097541356, 0.18685304435770977,
+                                   0.11389292557082253, 0.03826326056674867};
+    constexpr double weight[10] = {0.008807003569575447, 0.020300714900193223, 0.031336024167054395, 0.04163837078835236,
+                                     0.05096505990862035, 0.0590972659807593, 0.06584431922458844, 0.0710480546591912,
+                                     0.07458649323630212, 0.07637669356536314};
+    const V4 zero{}, sd = sqrt4(min4(max4(c, all4(1e-300)), all4(1e300)));
+    const V4 lower = min4(max4((lo - mu) / sd, all4(-1e90)), all4(1e90));
+    const V4 upper = min4(max4((hi - mu) / sd, all4(-1e90)), all4(1e90));
+    const auto flip = lower + upper < zero;
+    const V4 a = flip ? -upper : lower, b = flip ? -lower : upper, ref = max4(a, zero);
+    const V4 left = max4(a, all4(-7.0));
+    const V4 width = min4(b - left, ref - left + 50.0 / (ref + sqrt4(ref * ref + 50.0)));
+    V4 s0 = zero, s1 = zero, s2 = zero, s3 = zero, s4 = zero;
+    for (int k = 0; k < 10; k++)
+        for (int side = -1; side <= 1; side += 2) {
+            const V4 t = width * (0.5 + side * node[k]);
+            const V4 d = left - ref;  // x^2 - ref^2 = (t + d) (t + d + 2 ref)
+            const V4 f = weight[k] * exp4(-0.5 * (t + d) * (t + d + 2.0 * ref)), u = all4(side * node[k]);
+            s0 += f;
+            s1 += f * u;
+            s2 += f * u * u;
+            s3 += f * u * u * u;
+            s4 += f * u * u * u * u;
+        }
+    const V4 over = 1.0 / max4(s0, all4(smallest)), m = s1 * over, q2 = s2 * over, q3 = s3 * over, q4 = s4 * over;
+    const V4 unit = sd * width, sign = flip ? all4(-1.0) : all4(1.0);
+    const V4 v = max4(q2 - m * m, zero);
+    Shape4 r;
+    r.mean = min4(max4((flip ? mu - sd * left : mu + sd * left) + sign * unit * (0.5 + m), lo), hi);
+    r.m2 = unit * unit * v;
+    r.m3 = sign * unit * unit * unit * (q3 - 3.0 * m * q2 + 2.0 * m * m * m);
+    r.m4 = unit * unit * unit * unit * max4(q4 - 4.0 * m * q3 + 6.0 * m * m * q2 - 3.0 * m * m * m * m, zero);
+    return r;
+}
+
+// of a uniform on [-s, s] plus N(0, R)
+inline Shape4 uniform_gaussian_shape4(V4 mu, V4 c, V4 s, V4 R) {
+    const V4 V = max4(c + R, all4(1e-300)), gain = c / V, g2 = gain * gain;
+    const Shape4 t = truncated_shape4(mu, V, -s, s);
+    Shape4 r;
+    r.mean = mu + gain * (t.mean - mu);
+    r.m2 = gain * R + g2 * t.m2;
+    r.m3 = g2 * gain * t.k3();
+    r.m4 = g2 * g2 * t.k4() + 3.0 * r.m2 * r.m2;
+    return r;
+}
+
+inline Shape4 gaussian_shape4(V4 mu, V4 c, V4 R) {
+    const V4 V = max4(c + R, all4(1e-300));
+    Shape4 r{};
+    r.mean = mu * (R / V);
+    r.m2 = c * (R / V);
+    r.m4 = 3.0 * r.m2 * r.m2;
+    return r;
+}
+
+// of two explanations, the second with probability p
+inline Shape4 mixture_shape4(const Shape4& f, const Shape4& g, V4 p) {
+    const V4 one = 1.0 - p, mean = one * f.mean + p * g.mean, a = f.mean - mean, b = g.mean - mean;
+    Shape4 r;
+    r.mean = mean;
+    r.m2 = one * (f.m2 + a * a) + p * (g.m2 + b * b);
+    r.m3 = one * (f.m3 + 3.0 * a * f.m2 + a * a * a) + p * (g.m3 + 3.0 * b * g.m2 + b * b * b);
+    r.m4 = one * (f.m4 + 4.0 * a * f.m3 + 6.0 * a * a * f.m2 + a * a * a * a) +
+           p * (g.m4 + 4.0 * b * g.m3 + 6.0 * b * b * g.m2 + b * b * b * b);
+    return r;
+}
+
 // d / sqrt(V), held where its square would overflow
 inline V4 standardised4(V4 d, V4 V) { return min4(max4(d / sqrt4(V), all4(-1e90)), all4(1e90)); }
 
