@@ -1,5 +1,6 @@
 // Entry points of core/ep.hpp.
 #include "ep.hpp"
+#include "ep_learn.hpp"
 
 namespace hw {
 namespace HW_ISA {
@@ -11,44 +12,55 @@ std::size_t block_size(const EpArgs& a) {
     return stages * (2 * n + n * (n + 1)) + stages * 2 * n + 2 * std::size_t(a.rows) + 3 * std::size_t(a.groups) + 4 + shape;
 }
 
+struct Place {
+    V* p;
+    V* take(std::ptrdiff_t size) {
+        V* q = p;
+        p += size;
+        return q;
+    }
+};
+
+// the arrays of a block; `f` gets its slopes
+template <class N>
+void settle_in(Ep<N>& ep, EpFound& f, Place& place) {
+    const EpArgs& a = ep.a;
+    const std::ptrdiff_t n = ep.n, stages = a.T + 1, tri = n * (n + 1) / 2, square = stages * n * n;
+    EpState& s = ep.s;
+    s.mp = place.take(stages * n);
+    s.eb = place.take(stages * n);
+    s.Pp = place.take(stages * tri);
+    s.Lb = place.take(stages * tri);
+    s.m = place.take(stages * n);
+    s.D = place.take(stages * n);
+    s.tau = place.take(a.rows);
+    s.nu = place.take(a.rows);
+    s.s = place.take(a.groups + 1);
+    f.slope = place.take(a.groups + 1);
+    if (!a.k3) return;
+    EpCross& c = ep.cross;
+    c.S = place.take(square);
+    c.Pf = place.take(square);
+    c.B = place.take(square);
+    c.X0 = place.take(square);
+    c.X1 = place.take(square);
+    c.w3 = place.take(stages * n);
+    c.w4 = place.take(stages * n);
+    c.r3 = place.take(a.rows);
+    c.r4 = place.take(a.rows);
+}
+
 template <class N>
 int run(N n, const EpArgs& a) {
     for (int first = 0; first < a.members; first += lanes) {
         Ep<N> ep{n, a, {first, a.members - 1}, {}, {}};
-        const std::ptrdiff_t stages = a.T + 1, tri = n * (n + 1) / 2;
-        V* p = reinterpret_cast<V*>(a.work);
-        const auto take = [&p](std::ptrdiff_t size) {
-            V* q = p;
-            p += size;
-            return q;
-        };
-        EpState& s = ep.s;
-        s.mp = take(stages * n);
-        s.eb = take(stages * n);
-        s.Pp = take(stages * tri);
-        s.Lb = take(stages * tri);
-        s.m = take(stages * n);
-        s.D = take(stages * n);
-        s.tau = take(a.rows);
-        s.nu = take(a.rows);
-        s.s = take(a.groups + 1);
         EpFound f{};
-        f.slope = take(a.groups + 1);
-        if (a.k3) {
-            EpCross& c = ep.cross;
-            const std::ptrdiff_t square = stages * n * n;
-            c.S = take(square);
-            c.Pf = take(square);
-            c.B = take(square);
-            c.X0 = take(square);
-            c.X1 = take(square);
-            c.w3 = take(stages * n);
-            c.w4 = take(stages * n);
-            c.r3 = take(a.rows);
-            c.r4 = take(a.rows);
-        }
+        Place place{reinterpret_cast<V*>(a.work)};
+        settle_in(ep, f, place);
         const EpCross wanted = ep.cross;
         ep.cross = EpCross{};
+        EpState& s = ep.s;
+        const std::ptrdiff_t stages = a.T + 1;
         const auto member = [&](int l) { return first + l < a.members ? first + l : a.members - 1; };
         for (int l = 0; l < lanes; l++) {
             for (int g = 0; g < a.groups; g++) s.s[g].set(l, a.s[std::ptrdiff_t(member(l)) * a.groups + g]);
@@ -68,24 +80,17 @@ int run(N n, const EpArgs& a) {
             }
             ep.forget();
             EpFound none = f;
-            ep.clear(none);
-            ep.template forward<false>(none, 1.0);  // the message of the sites that were given
-            ep.template backward<false>(none);
+            ep.look(none);  // the message of the sites that were given
         } else {
             ep.start();
         }
-        int used = 0;
-        while (used < a.sweeps) {
-            ep.sweep(f, a.damping);
-            used++;
-            if (max_lanes(f.residual) < a.tol) break;
-        }
+        const int used = a.sweeps > 0 ? ep.settle(f, a.sweeps, a.tol, a.damping) : 0;
         ep.cross = wanted;
         ep.look(f);
         if (a.k3) ep.shapes(a.k3, a.k4);
         for (int l = 0; l < lanes && first + l < a.members; l++) {
             const std::ptrdiff_t k = first + l;
-            a.log_z[k] = f.log_z[l];
+            a.log_z[k] = ep.sound(f, l) ? f.log_z[l] : minus_inf;
             a.residual[k] = f.residual[l];
             a.worst[k] = f.worst[l];
             a.used[k] = used;
@@ -103,6 +108,21 @@ int run(N n, const EpArgs& a) {
     return 0;
 }
 
+template <class N>
+int learn(N n, const EpLearnArgs& a) {
+    Ep<N> ep{n, a.base, {0, lanes - 1}, {}, {}};
+    EpLearner<N> learner{ep, a, {}, nullptr, nullptr, nullptr, nullptr, nullptr, 0, {}, {}, {}, 0, false};
+    Place place{reinterpret_cast<V*>(a.base.work)};
+    settle_in(ep, learner.f, place);
+    const std::ptrdiff_t size = std::ptrdiff_t(a.base.T + 1) * n;
+    learner.keep_m = place.take(size);
+    learner.keep_D = place.take(size);
+    learner.keep_tau = place.take(a.base.rows);
+    learner.keep_nu = place.take(a.base.rows);
+    learner.was = place.take(a.base.groups + 1);
+    return learner.run();
+}
+
 }  // namespace
 
 std::size_t ep_workspace(const EpArgs& a) { return block_size(a) * lanes; }
@@ -115,6 +135,22 @@ int ep_run(const EpArgs& a) {
         case 3: return run(Dim<3>(), a);
         case 4: return run(Dim<4>(), a);
         default: return run(Dim<0>(a.n), a);
+    }
+}
+
+std::size_t ep_learn_workspace(const EpLearnArgs& a) {
+    const std::size_t more = 2 * std::size_t(a.base.T + 1) * a.base.n + 2 * std::size_t(a.base.rows) + a.base.groups + 1;
+    return ep_workspace(a.base) + more * lanes;
+}
+
+int ep_learn(const EpLearnArgs& a) {
+    const FlushTiny flush;
+    switch (a.base.n) {
+        case 1: return learn(Dim<1>(), a);
+        case 2: return learn(Dim<2>(), a);
+        case 3: return learn(Dim<3>(), a);
+        case 4: return learn(Dim<4>(), a);
+        default: return learn(Dim<0>(a.base.n), a);
     }
 }
 

@@ -128,6 +128,7 @@ struct EpFound {
     V log_z;      // evidence
     V* slope;     // (groups + 1,): d log Z / d log s, d log Z / d logit eps
     V worst;      // smallest log Z of a site
+    V far;        // largest squared distance of a site's mean from its cavity's, in the cavity's variances
 };
 
 // What the shapes of the beliefs need, filled by `look`; null pointers: not wanted.
@@ -298,8 +299,9 @@ struct Ep {
         return V(0.5) * ((nu * nu * v + V(2.0) * nu * mu - tau * mu * mu) / f - of(log4(f.v)));
     }
 
-    static inline void note(EpFound& f, const V& mean, const V& var, const Tilted4& t) {
-        const V tv = larger(of(t.var), V(1e-300));
+    static inline void note(EpFound& f, const V& mean, const V& var, const Tilted4& t, const V& mu, const V& c) {
+        const V tv = larger(of(t.var), V(1e-300)), off = of(t.mean) - mu;
+        f.far = larger(f.far, off * off / larger(c, V(1e-300)));
         const V d = of(t.mean) - mean, e = magnitude(tv - var) / tv;
         f.residual = larger(f.residual, larger(of(sqrt4((d * d / tv).v)), e));
     }
@@ -331,7 +333,7 @@ struct Ep {
             const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9));
             const V c = v / open, mu = (z - v * s.nu[k]) / open;
             const Tilted4 q = tilted(k, mu, c);
-            note(f, z, v, q);
+            note(f, z, v, q, mu, c);
             if constexpr (renew) {
                 const V tv = larger(of(q.var), V(1e-300));
                 V tau = V(1.0) / tv - V(1.0) / larger(c, V(1e-300));
@@ -420,10 +422,9 @@ struct Ep {
                     ms[i] = mp[i];
                     for (int j = 0; j < n; j++) ms[i] += Ps[i * n + j] * eta[j];
                 }
-                if constexpr (!renew) {
+                if (!renew && cross.S) {
                     give(t, ms, Ps);
-                    if (cross.S)
-                        for (int i = 0; i < n * n; i++) cross.S[t * n * n + i] = Ps[i];
+                    for (int i = 0; i < n * n; i++) cross.S[t * n * n + i] = Ps[i];
                 }
                 rows<renew>(t, ms, Ps, f, damping);
             }
@@ -722,7 +723,7 @@ struct Ep {
             const V know = larger(W[i * n + i], V(1e-8) / (half * half));  // nothing known: a wide cavity
             const V c = larger(V(1.0) / know - D[i], V(1e-12) * D[i]), mu = m[i] + r[i] / know;
             const Tilted4 q = uniform4(mu.v, c.v, half.v);
-            note(f, m[i] + D[i] * r[i], D[i] * (V(1.0) - D[i] * know), q);
+            note(f, m[i] + D[i] * r[i], D[i] * (V(1.0) - D[i] * know), q, mu, c);
             if constexpr (renew) {
                 const V rest = larger(V(1.0) - of(q.var) / c, V(1e-6));  // 1 - tilted variance over the cavity's
                 const V dD = of(q.var) / rest - D[i], dm = mu + (of(q.mean) - mu) / rest - m[i];
@@ -763,6 +764,7 @@ struct Ep {
 
     void clear(EpFound& f) const {
         f.residual = V(0.0);
+        f.far = V(0.0);
         f.log_z = V(0.0);
         f.worst = V(1e300);
         for (int g = 0; g <= a.groups; g++) f.slope[g] = V(0.0);
@@ -773,12 +775,30 @@ struct Ep {
         forward<true>(f, damping);
         backward<true>(f);
     }
-    // Evidence, its slopes and the belief. The message must belong to the sites: a sweep's does.
+
+    // Sweep until the moments agree within `tol` in every lane that is alive; returns the sweeps. A lane is dead when its
+    // numbers are no longer finite or a factor lies thousands of standard deviations from where the others put it: no
+    // trajectory fits, and its sites run away.
+    int settle(EpFound& f, int sweeps, double tol, double damping) {
+        for (int k = 1; k <= sweeps; k++) {
+            sweep(f, damping);
+            bool done = true;
+            for (int l = 0; l < lanes; l++)
+                if (alive(f, l) && !(f.residual[l] < tol)) done = false;
+            if (done) return k;
+        }
+        return sweeps;
+    }
+    static inline bool alive(const EpFound& f, int l) { return finite(f.residual[l]) && f.far[l] < 1e8; }
+
+    // Evidence, its slopes and the belief of the sites as they are; both halves without renewing anything.
     void look(EpFound& f) {
         clear(f);
         forward<false>(f, 1.0);
         backward<false>(f);
-        // backward<false> writes the message of the same sites again, so nothing has moved
+    }
+    static inline bool sound(const EpFound& f, int l) {
+        return finite(f.log_z[l]) && finite(f.residual[l]) && f.worst[l] > -60.0;
     }
 };
 

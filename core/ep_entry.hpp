@@ -54,7 +54,33 @@ struct EpArgs {
     double* work;                  // ep_workspace doubles, on a 32-byte boundary
 };
 
+// Half-widths and the rate of outliers found by evidence; see core/ep_learn.hpp. `base` has four members for the lanes
+// (its m, D, tau, nu hold one: the mode's, on the way in too if it is warm).
+struct EpLearnArgs {
+    EpArgs base;
+    const bool* free;                        // (groups,)
+    const double *floor, *cap, *scale;       // (groups,): bounds, and the order of size
+    const double *start, *was;               // (groups,): first guess; half-widths of warm sites
+    const double* count;                     // (groups,): rows of each
+    bool learn_eps;
+    double rate, start_eps;                  // the rate where it is known; logit of the first guess
+    double power;                            // prior of a half-width: s^(power-1)
+    double beta_a, beta_b;                   // prior of the rate
+    int steps, few, many, most;              // Newton steps; sweeps of a step, of the first one, of a node
+    double tol, tol_nodes, close, least, narrow;
+    int nodes;
+    const double *z, *log_proposal;          // (nodes, q), (nodes,)
+    // found
+    double *mode, *H, *phi, *log_weight;     // (q,), (q,q), (nodes,q), (nodes,)
+    double *x, *P, *k3, *k4, *centre, *out;  // (T+1,n), (T+1,n,n), ...: of the mixture; out (rows,) or null
+    double *log_evidence, *residual;
+    std::int32_t* used;                      // nodes
+    long* sweeps_used;
+};
+
 }  // namespace hw
 
 HW_KERNEL(std::size_t, ep_workspace, const hw::EpArgs& args)
 HW_KERNEL(int, ep_run, const hw::EpArgs& args)
+HW_KERNEL(std::size_t, ep_learn_workspace, const hw::EpLearnArgs& args)
+HW_KERNEL(int, ep_learn, const hw::EpLearnArgs& args)
