@@ -254,6 +254,7 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     l.close = real("close");
     l.least = real("least");
     l.narrow = real("narrow");
+    l.warp = real("warp");
     a.damping = real("damping");
     nb::dict found;
     found["sites"] = p.sites(sites, 1);

@@ -64,7 +64,7 @@ struct EpLearnArgs {
     const double* count;                     // (groups,): rows of each
     bool learn_eps;
     double rate, start_eps;                  // the rate where it is known; logit of the first guess
-    double power;                            // prior of a half-width: s^(power-1)
+    double power, warp;                      // prior of a half-width: s^(power-1); nodes are Gaussian in s^warp
     double beta_a, beta_b;                   // prior of the rate
     int steps, few, many, most;              // Newton steps; sweeps of a step, of the first one, of a node
     double tol, tol_nodes, close, least, narrow;

@@ -4,7 +4,9 @@
 // (floor, cap), of a rate a beta law. log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the
 // four lanes one holds phi, three hold phi + h e_j, whose slopes give three columns of the Hessian, other coordinates at
 // the next step. Around the mode, `nodes` points phi + H^(-1/2) z_k are evaluated and weighted by evidence over
-// proposal; the answer is their mixture. Sites follow phi from point to point, so a point costs few sweeps.
+// proposal; the answer is their mixture. A half-width that may as well be 0 has an exponential tail in log s and none in a
+// power of s, so the search and the nodes live in u = s^warp (its density has the prior s^(a-warp) in log s, and at its
+// mode the two Hessians differ by du/dphi only). Sites follow phi from point to point, so a point costs few sweeps.
 #pragma once
 
 #include "ep.hpp"
@@ -51,12 +53,12 @@ struct EpLearner {
     double log_prior(const double* phi) const {
         double p = 0.0;
         for (int j = 0; j < q; j++)
-            p += group[j] >= 0 ? a.power * phi[j]
+            p += group[j] >= 0 ? (a.power - a.warp) * phi[j]
                                : a.beta_a * phi[j] - (a.beta_a + a.beta_b) * std::log1p(std::exp(phi[j]));
         return p;
     }
     double prior_slope(int j, double phi) const {
-        return group[j] >= 0 ? a.power : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi));
+        return group[j] >= 0 ? a.power - a.warp : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi));
     }
 
     // parameters of lane l
@@ -368,7 +370,8 @@ struct EpLearner {
                         x[i] = s / L[i][i];
                     }
                     for (int j = 0; j < q; j++) {
-                        at[l][j] = phi[j] + x[j];
+                        const double u = 1.0 + a.warp * x[j];  // s^warp over the mode's
+                        at[l][j] = group[j] < 0 ? phi[j] + x[j] : u > 0.0 ? phi[j] + std::log(u) / a.warp : lo[j] - 1.0;
                         if (at[l][j] > hi[j] || at[l][j] < lo[j]) inside[l] = false;
                     }
                     if (!inside[l])
@@ -405,7 +408,7 @@ struct EpLearner {
         if (!(sum > 0.0)) return 2;
         finish(sum);
         double half_log_det = 0.0;
-        for (int j = 0; j < q; j++) half_log_det += std::log(L[j][j]);
+        for (int j = 0; j < q; j++) half_log_det += std::log(L[j][j]) - (group[j] >= 0 ? a.warp * phi[j] : 0.0);
         *a.log_evidence = nodes > 1 ? top + std::log(sum / nodes) - half_log_det
                                     : top + 0.5 * q * log_2pi - half_log_det;
         *a.sweeps_used = sweeps;
