@@ -195,6 +195,7 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
     found["k4"] = fresh({members, stages, n}, &a.k4);
     found["log_z"] = fresh({members}, &a.log_z);
     found["slope"] = fresh({members, static_cast<std::size_t>(a.groups) + 1}, &a.slope);
+    found["learned"] = fresh({members, static_cast<std::size_t>(a.groups)}, &a.learned);
     found["residual"] = fresh({members}, &a.residual);
     found["worst"] = fresh({members}, &a.worst);
     found["out"] = fresh({members, rows}, &a.out);
@@ -255,6 +256,7 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     l.least = real("least");
     l.narrow = real("narrow");
     l.warp = real("warp");
+    l.reference = real("reference");
     a.damping = real("damping");
     nb::dict found;
     found["sites"] = p.sites(sites, 1);

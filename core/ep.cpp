@@ -9,7 +9,7 @@ namespace {
 std::size_t block_size(const EpArgs& a) {
     const std::size_t stages = a.T + 1, n = a.n;
     const std::size_t shape = a.k3 ? stages * (5 * n * n + 2 * n) + 2 * std::size_t(a.rows) : 0;
-    return stages * (2 * n + n * (n + 1)) + stages * 2 * n + 2 * std::size_t(a.rows) + 3 * std::size_t(a.groups) + 4 + shape;
+    return stages * (2 * n + n * (n + 1)) + stages * 2 * n + 2 * std::size_t(a.rows) + 4 * std::size_t(a.groups) + 4 + shape;
 }
 
 struct Place {
@@ -37,6 +37,7 @@ void settle_in(Ep<N>& ep, EpFound& f, Place& place) {
     s.nu = place.take(a.rows);
     s.s = place.take(a.groups + 1);
     f.slope = place.take(a.groups + 1);
+    f.learned = place.take(a.groups);
     if (!a.k3) return;
     EpCross& c = ep.cross;
     c.S = place.take(square);
@@ -93,6 +94,7 @@ int run(N n, const EpArgs& a) {
             a.log_z[k] = ep.sound(f, l) ? f.log_z[l] : minus_inf;
             a.residual[k] = f.residual[l];
             a.worst[k] = f.worst[l];
+            for (int g = 0; g < a.groups; g++) a.learned[k * a.groups + g] = f.learned[g][l];
             a.used[k] = used;
             for (int g = 0; g <= a.groups; g++) a.slope[k * (a.groups + 1) + g] = f.slope[g][l];
             for (std::ptrdiff_t i = 0; i < stages * n; i++) {

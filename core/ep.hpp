@@ -127,6 +127,7 @@ struct EpFound {
     V residual;   // largest distance of a site's moments from the belief's, in standard deviations
     V log_z;      // evidence
     V* slope;     // (groups + 1,): d log Z / d log s, d log Z / d logit eps
+    V* learned;   // (groups,): sum over the rows of a half-width of (1 - posterior / prior variance)^2
     V worst;      // smallest log Z of a site
     V far;        // largest squared distance of a site's mean from its cavity's, in the cavity's variances
 };
@@ -356,7 +357,7 @@ struct Ep {
             } else {
                 f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], mu, c);
                 f.worst = smaller(f.worst, of(q.log_z));
-                slopes(k, q, f);
+                slopes(k, q, v, f);
                 if (cross.S) ratios(shape(k, mu, c), v, cross.r3 + k, cross.r4 + k);
                 if (a.out) {
                     for (int l = 0; l < lanes && block.first + l <= block.last; l++)
@@ -366,9 +367,14 @@ struct Ep {
         }
     }
 
-    inline void slopes(int k, const Tilted4& q, EpFound& f) const {
+    inline void slopes(int k, const Tilted4& q, const V& v, EpFound& f) const {
         if (kind(k) == ep_truncation) return;
-        if (a.group[k] >= 0) f.slope[a.group[k]] += of(q.slope_s);
+        if (a.group[k] >= 0) {
+            f.slope[a.group[k]] += of(q.slope_s);
+            const V own = s.s[a.group[k]] * s.s[a.group[k]] * V(1.0 / 3.0), all = larger(own + variance(k), V(1e-300));
+            const V share = larger(V(1.0) - v / all, V(0.0)) * own / all;
+            f.learned[a.group[k]] += share * share;
+        }
         if (a.mix) {
             const V R = larger(variance(k), V(1e-300));
             for (int g = 0; g < a.groups; g++) {
@@ -742,7 +748,11 @@ struct Ep {
                 const V spread = D[i] + c, d = m[i] - mu;
                 f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + of(log4(spread.v)) + d * d / spread);
                 f.worst = smaller(f.worst, of(q.log_z));
-                if (t > 0) f.slope[a.group_w[i]] += of(q.slope_s);
+                if (t > 0) {
+                    const V share = larger(V(1.0) - V(3.0) * D[i] * (V(1.0) - D[i] * know) / (half * half), V(0.0));
+                    f.slope[a.group_w[i]] += of(q.slope_s);
+                    f.learned[a.group_w[i]] += share * share;
+                }
                 if (cross.S)
                     ratios(truncated_shape4(mu.v, c.v, -half.v, half.v), D[i] * (V(1.0) - D[i] * know),
                            cross.w3 + t * n + i, cross.w4 + t * n + i);
@@ -768,6 +778,7 @@ struct Ep {
         f.log_z = V(0.0);
         f.worst = V(1e300);
         for (int g = 0; g <= a.groups; g++) f.slope[g] = V(0.0);
+        for (int g = 0; g < a.groups; g++) f.learned[g] = V(0.0);
     }
 
     void sweep(EpFound& f, double damping) {

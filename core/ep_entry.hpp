@@ -48,6 +48,7 @@ struct EpArgs {
     double *x, *P;                 // (members,T+1,n), (members,T+1,n,n)
     double *k3, *k4;               // (members,T+1,n): standardised cumulants of the states; or null
     double *log_z, *slope;         // (members,), (members,groups+1)
+    double* learned;               // (members,groups): sum of (1 - posterior / prior variance)^2
     double *residual, *worst;      // (members,)
     double* out;                   // (members,rows) probability that a row is an outlier or lost; or null
     std::int32_t* used;            // (members,) sweeps
@@ -64,7 +65,7 @@ struct EpLearnArgs {
     const double* count;                     // (groups,): rows of each
     bool learn_eps;
     double rate, start_eps;                  // the rate where it is known; logit of the first guess
-    double power, warp;                      // prior of a half-width: s^(power-1); nodes are Gaussian in s^warp
+    double power, reference, warp;           // prior of log s: s^power told^reference; nodes are Gaussian in s^warp
     double beta_a, beta_b;                   // prior of the rate
     int steps, few, many, most;              // Newton steps; sweeps of a step, of the first one, of a node
     double tol, tol_nodes, close, least, narrow;
