@@ -11,8 +11,10 @@ void bind_nonlinear(nb::module_& m);
 void bind_loss(nb::module_& m);
 void bind_lp(nb::module_& m);
 void bind_chain(nb::module_& m);
+void bind_constrain(nb::module_& m);
 void bind_noise(nb::module_& m);
 void bind_ep(nb::module_& m);
+void bind_sampler(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -26,6 +28,8 @@ NB_MODULE(_core, m) {
     bind_loss(m);
     bind_lp(m);
     bind_chain(m);
+    bind_constrain(m);
     bind_noise(m);
     bind_ep(m);
+    bind_sampler(m);
 }

@@ -87,6 +87,14 @@ def _cases():
     truth, record = hw.simulate(unknown, u, seed=5)
     model = dataclasses.replace(unknown, w=hw.Uniform.unknown(at_most=5.0), e=hw.Uniform.unknown(at_most=5.0))
     found.append(Case("oscillator unknown", model, truth, holes(record, 6, 0.2)))
+    bounded = dataclasses.replace(
+        oscillator(hw.Gaussian([0.1, 0.2, 0.1]), hw.Gaussian([0.3, 0.4]), ball),
+        bounds=hw.Box([-2.7, -2.7, -2.1], [0.6, 3.2, np.inf]),
+    )
+    add("oscillator in a box", bounded, u=u, outage=(20, 30))
+    # x0 + x2 between two numbers, x1 from below, and an equality
+    rows = hw.Halfspaces([[1, 0, 1], [0, 1, 0], [1, -1, 0.5]], [-2, -1, 0.2], [1, np.inf, 0.2])
+    add("oscillator on a plane", dataclasses.replace(bounded, bounds=rows), u=u)
     walk = hw.Linear([[1.0]], None, [[1.0]], hw.Gaussian(0.1), hw.Gaussian(1.0), hw.Normal([0.0], 1.0))
     add("walk", walk, T=40)
     turn = hw.Nonlinear(
@@ -115,6 +123,12 @@ def _settings():
         "KalmanSmoother": [{"lag": 4}],
         "ExtendedKalman": [{"smooth": True}],
         "UnscentedKalman": [{"smooth": True}],
+        "Constrained": [
+            {"by": "truncate", "feedback": True},
+            {"by": "project", "method": hw.KalmanSmoother()},
+            {"by": "nearest", "method": hw.GPB()},
+            {"method": hw.UnscentedKalman(), "feedback": True},
+        ],
     }
     found = []
     for name in ESTIMATORS:

@@ -7,8 +7,8 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud DataQualityWarning Estimate
-Estimator ExtendedKalman FearnheadClifford GPB Gaussian HalfwidthError KalmanFilter KalmanSmoother Learned Linear
+BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud Constrained DataQualityWarning Estimate
+Estimator ExtendedKalman FearnheadClifford GPB Gaussian Halfspaces HalfwidthError KalmanFilter KalmanSmoother Learned Linear
 LogTooBig Markov MemoryChoice Missing Mixed Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls
 SequentialLP Status Uniform UnscentedKalman Unsolved Window __version__ choose_memory ensemble_interval estimate
 forecast from_continuous learn resume score simulate stream

@@ -108,6 +108,9 @@ def test_what_a_job_refuses(given, words):
         ({"w": {"uniform": 1.0, "at_most": 2.0}}, "one is expected"),
         ({"x0": {"mean": [0, 0]}}, "the key `x0`: it has mean"),
         ({"bounds": {"lo": [0, 0]}}, "the key `bounds`: it has lo"),
+        ({"bounds": {"D": [[1, 0, 0]], "lo": 0}}, "`bounds` has a `D` of shape"),
+        ({"bounds": {"D": [[1, 0]], "lo": "a"}}, "the key `bounds`: `lo` is 'a'"),
+        ({"bounds": 3}, "the key `bounds` is 3"),
         ({"states": "place"}, "the key `states` is 'place', a list of names"),
         ({"dt": "fast"}, "the key `dt` is 'fast', a number"),
         ({"dT": 1}, "unknown key `dT`"),
@@ -125,6 +128,8 @@ def test_all_kinds_of_noise_and_priors():
     assert isinstance(linear(spec(x0={"lo": [0, 0], "hi": [1, 1]})).x0, hw.Box)
     bounded = linear(spec(bounds={"lo": [-9, -9], "hi": [9, 9]}, E=[[1, 0.1], [0, 1]], x0=None))
     assert bounded.bounds is not None
+    planes = linear(spec(bounds={"D": [[1, -1]], "lo": 0}))
+    assert planes.bounds.contains(np.array([2.0, 1.0]))
     assert bounded.E is not None
     unknown = linear(spec(A=[[1, float("nan")], [0, 1]], theta_bounds={"lo": [0.1], "hi": [0.9]}))
     assert len(unknown.theta_entries) == 1

@@ -20,6 +20,7 @@ _HOME: dict[str, str] = {
     "Gaussian": "noise",
     "Mixed": "noise",
     "Box": "spread",
+    "Halfspaces": "spread",
     "Normal": "spread",
     "Cloud": "spread",
     "Bernoulli": "loss",
@@ -77,6 +78,7 @@ if TYPE_CHECKING:
     from halfwidth.loss import Markov as Markov
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.methods.constrain import Constrained as Constrained
     from halfwidth.methods.kalman import KalmanFilter as KalmanFilter
     from halfwidth.methods.kalman import KalmanSmoother as KalmanSmoother
     from halfwidth.methods.loss import BKF1 as BKF1
@@ -107,6 +109,7 @@ if TYPE_CHECKING:
     from halfwidth.simulate import simulate as simulate
     from halfwidth.spread import Box as Box
     from halfwidth.spread import Cloud as Cloud
+    from halfwidth.spread import Halfspaces as Halfspaces
     from halfwidth.spread import Normal as Normal
     from halfwidth.stream import resume as resume
     from halfwidth.stream import stream as stream

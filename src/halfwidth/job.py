@@ -18,7 +18,7 @@ A model as plain data has the keys of `hw.Linear`::
     w = { gaussian = [1e-4, 1e-3] }  # or uniform = [...], or both, or at_least/at_most = [...]
     e = { uniform = 0.5 }
     x0 = { mean = [0, 0], covariance = [[1, 0], [0, 1]] }   # or { lo = [...], hi = [...] }
-    bounds = { lo = [...], hi = [...] }                     # of every state, optional
+    bounds = { lo = [...], hi = [...] }                     # of every state, or of D x with D = [[...]]; optional
     E = [[...]]                      # optional, unit upper triangular, as is F
     theta_bounds = { lo = [...], hi = [...] }               # of the nan entries of A, B, C
 """
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from halfwidth.model import Linear
     from halfwidth.noise import Noise
     from halfwidth.result import Estimate
-    from halfwidth.spread import Box, Normal
+    from halfwidth.spread import Box, Halfspaces, Normal
     from halfwidth.vehicle.track import Track
 
 _MODEL_KEYS = (
@@ -208,7 +208,7 @@ def linear(data: Mapping[str, Any]) -> "Linear":
         _prior(data, "x0"),
         E=_matrix(data, "E") if "E" in data else None,
         F=_matrix(data, "F") if "F" in data else None,
-        bounds=_box(data, "bounds"),
+        bounds=_bounds(data),
         names={"x": states, "y": outputs, "u": inputs},
         dt=_number(data, "dt", 1.0),
         theta_bounds=_box(data, "theta_bounds"),
@@ -313,6 +313,18 @@ def _prior(data: Mapping[str, Any], key: str) -> "Normal | Box | None":
         if {"lo", "hi"} == set(table):
             return Box(table["lo"], table["hi"])
         raise BadValue(f"it has {', '.join(table) or 'nothing'}, mean and covariance or lo and hi are expected")
+
+
+def _bounds(data: Mapping[str, Any]) -> "tuple[Any, Any] | Halfspaces | None":
+    """Return a box, or half-spaces where the table has a D."""
+    from halfwidth.spread import Halfspaces
+
+    given = data.get("bounds")
+    if not isinstance(given, Mapping) or "D" not in given:
+        return _box(data, "bounds")
+    table = _table(data, "bounds", ("D", "lo", "hi"))
+    with _at("bounds"):
+        return Halfspaces(**table)
 
 
 def _box(data: Mapping[str, Any], key: str) -> "tuple[Any, Any] | None":

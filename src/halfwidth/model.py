@@ -18,7 +18,7 @@ from halfwidth.array import Array, Function, real
 from halfwidth.derivative import differences
 from halfwidth.errors import BadShape, BadValue, Refused
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
-from halfwidth.spread import Box, Normal
+from halfwidth.spread import Box, Halfspaces, Normal
 from halfwidth.trace import Untraceable, compiled
 from halfwidth.varying import Varying, varying
 
@@ -68,7 +68,7 @@ class Linear:
         Prior of the state one step before the first row; None is a box without ends.
     E : (nx, nx) unit upper triangular, optional
     F : (ny, ny) unit upper triangular, optional
-    bounds : Box or (lo, hi), optional
+    bounds : Box, (lo, hi) or Halfspaces, optional
         Hard bounds on every x[t].
     loss : optional
         A loss process that the estimator is not told of.
@@ -100,7 +100,7 @@ class Linear:
     _: dataclasses.KW_ONLY
     E: Varying | None = None
     F: Varying | None = None
-    bounds: Box | None = None
+    bounds: Box | Halfspaces | None = None
     loss: Any = None
     names: Names = None  # type: ignore[assignment]
     dt: float = 1.0
@@ -117,7 +117,7 @@ class Linear:
         *,
         E: ArrayLike | Function | Varying | None = None,
         F: ArrayLike | Function | Varying | None = None,
-        bounds: Box | tuple[ArrayLike, ArrayLike] | None = None,
+        bounds: Box | Halfspaces | tuple[ArrayLike, ArrayLike] | None = None,
         loss: Any = None,
         names: Sequence[str] | Mapping[str, Sequence[str]] | Names | None = None,
         dt: float = 1.0,
@@ -241,7 +241,7 @@ class Nonlinear:
     nu: int = 0
     g_x: Callable[..., Any] | None = None
     h_x: Callable[..., Any] | None = None
-    bounds: Box | None = None
+    bounds: Box | Halfspaces | None = None
     loss: Any = None
     names: Names = None  # type: ignore[assignment]
     dt: float = 1.0
@@ -388,6 +388,16 @@ class Nonlinear:
 Model = Linear | Nonlinear
 
 
+def needs_a_box(model: Model, name: str) -> str | None:
+    """Return why a method that takes bounds entry by entry cannot take the model's, with a hint, or None."""
+    if isinstance(model.bounds, Halfspaces):
+        return (
+            f"`{name}` keeps each state between two numbers but `bounds` is `Halfspaces`"
+            "\nhint: bounds=Box(lo, hi), or a Gaussian model and Constrained()"
+        )
+    return None
+
+
 def arity(function: Callable[..., Any], most: int) -> int:
     """Return how many positional arguments `function` takes, at most `most`."""
     if isinstance(function, np.ufunc):
@@ -429,7 +439,7 @@ def _common(
     w: Noise,
     e: Noise,
     x0: Prior | None,
-    bounds: Box | tuple[ArrayLike, ArrayLike] | None,
+    bounds: Box | Halfspaces | tuple[ArrayLike, ArrayLike] | None,
     dt: float,
 ) -> None:
     put = object.__setattr__
@@ -449,7 +459,7 @@ def _common(
     elif x0.mean.shape != (nx,):
         raise BadShape(f"`x0` has a mean of shape {x0.mean.shape}, ({nx},) was expected from the model")
     put(model, "x0", x0)
-    put(model, "bounds", _box(bounds, nx, "bounds"))
+    put(model, "bounds", bounds.sized(nx, "bounds") if isinstance(bounds, Halfspaces) else _box(bounds, nx, "bounds"))
     if not isinstance(dt, int | float | np.number) or not np.isfinite(dt) or dt <= 0:
         raise BadValue(f"`dt` is {dt!r}, a positive number of seconds was expected")
     put(model, "dt", float(dt))

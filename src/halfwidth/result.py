@@ -199,13 +199,13 @@ class Newest(Estimate):
     @cached_property
     def spread(self) -> Spread | None:
         """Gaussian spread of the state."""
-        return Normal.of(self.x, np.asarray(self._belief.P)[None])
+        return Normal.of(self.x, np.asarray(self._belief.P)[None], getattr(self._belief, "within", None))
 
     @property
     def status(self) -> Status:
-        """Whether the push went well: code 2 contradicts a certainty, 3 left the range of floating point."""
+        """Whether the push went well: code 2 contradicts a certainty, 3 left the range of floats, 4 fits no bounds."""
         code = self._belief.code
-        return Status.OK if code < 2 else Status.REDUCED if code == 2 else Status.COLLAPSED
+        return Status.OK if code < 2 else {2: Status.REDUCED, 4: Status.INFEASIBLE}.get(code, Status.COLLAPSED)
 
     @property
     def loglik(self) -> float | None:
@@ -224,5 +224,6 @@ class Newest(Estimate):
 
     @property
     def info(self) -> Mapping[str, Any]:
-        """Number of rows pushed so far."""
-        return {"rows": self._belief.rows}
+        """Number of rows pushed so far, and what the method has to say of the newest."""
+        said = getattr(self._belief, "message", None)
+        return {"rows": self._belief.rows} | ({} if said is None else {"message": said})

@@ -1,14 +1,14 @@
-"""What is known of a state: a box, a Gaussian, or a cloud of points. Priors of x0 and spreads of answers.
+"""What is known of a state: a box, half-spaces, a Gaussian or a cloud. Priors of x0, bounds, spreads of answers.
 
 Each has ``interval(level) -> (lo, hi)`` and the flag ``guaranteed``, so that scores, plots and reports never ask which
 estimator ran.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from halfwidth.array import Array, covariance, extended, frozen, real
 from halfwidth.errors import BadShape, BadValue
@@ -81,6 +81,15 @@ class Box:
         hi = np.where(np.isfinite(self.hi), self.hi, lo)
         return np.asarray(0.5 * lo + 0.5 * hi)
 
+    def contains(self, x: Array) -> NDArray[np.bool_]:
+        """Return which of the states (..., nx) lie in the box."""
+        return np.asarray(((x >= self.lo) & (x <= self.hi)).all(axis=-1))
+
+    @property
+    def rows(self) -> tuple[Array, Array, Array]:
+        """The same as ``lo <= D x <= hi``: D, lo, hi."""
+        return np.eye(self.lo.shape[-1]), self.lo, self.hi
+
     def interval(self, level: float = 0.9) -> tuple[Array, Array]:
         """Return the box itself, whatever the level."""
         _level(level)
@@ -94,6 +103,67 @@ class Box:
                 hint="give a finite Box(lo, hi) or Normal(mean, P)",
             )
         return rng.uniform(self.lo, self.hi)
+
+
+@dataclass(frozen=True, eq=False)
+class Halfspaces:
+    """The state fulfils ``lo <= D x <= hi``, row by row; a row with equal ends is an equality. Bounds of a model.
+
+    Parameters
+    ----------
+    D : (m, nx) array_like
+        One constraint a row.
+    lo, hi : scalar or (m,) array_like
+        Ends in the units of ``D x``; infinite where there is none.
+
+    Raises
+    ------
+    BadShape, BadValue
+        If shapes do not fit, an entry is NaN, or `lo` exceeds `hi`.
+
+    Examples
+    --------
+    >>> ahead = Halfspaces([[1, -1], [1, 1]], [0, 2], [np.inf, 2])  # x0 >= x1 and x0 + x1 = 2
+    >>> ahead.contains(np.array([[1.5, 0.5], [0.5, 1.5]]))
+    array([ True, False])
+    """
+
+    D: Array
+    lo: Array
+    hi: Array
+
+    def __init__(self, D: ArrayLike, lo: ArrayLike = -np.inf, hi: ArrayLike = np.inf) -> None:
+        d = real(D, "D")
+        if d.ndim != 2:
+            raise BadShape(f"`D` has shape {d.shape}, (m, nx) was expected: one constraint a row")
+        ends = []
+        for name, value in (("lo", extended(lo, "lo")), ("hi", extended(hi, "hi"))):
+            if value.shape not in ((), (len(d),)):
+                raise BadShape(f"`{name}` has shape {value.shape}, ({len(d)},) was expected from `D` {d.shape}")
+            ends.append(np.array(np.broadcast_to(value, (len(d),))))
+        wrong = (ends[0] > ends[1]) | (ends[0] == np.inf) | (ends[1] == -np.inf)
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            raise BadValue(f"row {k} of `D` has lo = {ends[0][k]:g} and hi = {ends[1][k]:g}, which nothing fulfils")
+        object.__setattr__(self, "D", frozen(d))
+        object.__setattr__(self, "lo", frozen(ends[0]))
+        object.__setattr__(self, "hi", frozen(ends[1]))
+
+    def sized(self, n: int, name: str) -> "Halfspaces":
+        """Return the constraints themselves if they are on `n` states."""
+        if self.D.shape[1] != n:
+            raise BadShape(f"`{name}` has a `D` of shape {self.D.shape}, {n} columns were expected from the model")
+        return self
+
+    @property
+    def rows(self) -> tuple[Array, Array, Array]:
+        """D, lo, hi."""
+        return self.D, self.lo, self.hi
+
+    def contains(self, x: Array) -> NDArray[np.bool_]:
+        """Return which of the states (..., nx) obey every row, to the last bit: rounding may leave a plane."""
+        s = x @ self.D.T
+        return np.asarray(((s >= self.lo) & (s <= self.hi)).all(axis=-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +191,9 @@ class Normal:
     mean: Array
     P: Array
     guaranteed = False
+    _within: ClassVar[tuple[Array, Array] | None] = (
+        None  # (lo, hi) that every state is known to lie in: intervals end there
+    )
 
     def __init__(self, mean: ArrayLike, P: ArrayLike) -> None:
         m = np.atleast_1d(real(mean, "mean"))
@@ -136,11 +209,13 @@ class Normal:
         object.__setattr__(self, "P", frozen(covariance(p, "P")))
 
     @classmethod
-    def of(cls, mean: Array, P: Array) -> "Normal":
-        """Wrap a kernel's answer, (T, nx) and (T, nx, nx), without judging it again."""
+    def of(cls, mean: Array, P: Array, within: tuple[Array, Array] | None = None) -> "Normal":
+        """Wrap a kernel's answer, (T, nx) and (T, nx, nx), without judging it again; intervals stay inside `within`."""
         answer = object.__new__(cls)
         object.__setattr__(answer, "mean", mean)
         object.__setattr__(answer, "P", P)
+        if within is not None:
+            object.__setattr__(answer, "_within", within)
         return answer
 
     @property
@@ -153,7 +228,10 @@ class Normal:
         from statistics import NormalDist
 
         half = NormalDist().inv_cdf(0.5 + 0.5 * _level(level)) * self.sd
-        return self.mean - half, self.mean + half
+        lo, hi = self.mean - half, self.mean + half
+        if self._within is not None:
+            lo, hi = np.clip(lo, *self._within), np.clip(hi, *self._within)
+        return lo, hi
 
     def sample(self, rng: np.random.Generator) -> Array:
         """Draw one state (nx,)."""

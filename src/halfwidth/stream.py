@@ -187,6 +187,8 @@ class _Belief:
     loglik: float
     code: int
     rows: int
+    message: str | None = None
+    within: tuple[Array, Array] | None = None
 
 
 class _Stepped:
@@ -205,8 +207,10 @@ class _Stepped:
         self.pushed += 1
         x, P, loglik = self.method.belief(model, self.state)
         newest: Estimate = object.__new__(self.kind)
-        code = 0 if np.isfinite(x).all() else 3
-        object.__setattr__(newest, "_belief", _Belief(self.t, x, P, float(loglik), code, self.pushed))
+        verdict = getattr(self.method, "verdict", None)
+        code, message, within = (0, None, None) if verdict is None else verdict(model, self.state)
+        code = code if np.isfinite(x).all() else 3
+        object.__setattr__(newest, "_belief", _Belief(self.t, x, P, float(loglik), code, self.pushed, message, within))
         return newest
 
     def snapshot(self) -> bytes:

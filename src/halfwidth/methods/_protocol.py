@@ -35,7 +35,11 @@ class Estimator(Protocol):
 
 
 class Recursive(Protocol[State]):
-    """A method that takes one row at a time; a step returns a new state and changes nothing."""
+    """A method that takes one row at a time; a step returns a new state and changes nothing.
+
+    One that has more to say of a row also gives ``verdict(model, state)``: the code of `Newest.status`, a message or
+    None, and the (lo, hi) that intervals end at, or None.
+    """
 
     def init(self, model: Model) -> State:
         """Return the belief one step before the first row."""

@@ -62,6 +62,47 @@ class KalmanFilter:
         """Return the kernel's online object, its belief one step before the first push being that of time `t`."""
         return _stream(self, model, t, 0)
 
+    def init(self, model: Linear) -> "Belief":
+        """Return the belief one step before the first row."""
+        x0 = model.x0
+        assert isinstance(x0, Normal)
+        return Belief(x0.mean, x0.P, 0.0, 0, 0)
+
+    def step(self, model: Linear, state: "Belief", y: Array, u: Array | None, t: float, dt: float) -> "Belief":
+        """Return the belief after one row, for a method that changes it in between; a stream does without."""
+        A, B, C, Q, R = _folded(model, {**model.matrices, "Q": model.w.cov(), "R": model.e.cov()}, state.row, t, dt)
+        more = {} if u is None else {"u": np.ascontiguousarray(u[None])}
+        out = _core.kalman_run(
+            "filter",
+            A[None],
+            B[None] if model.nu else None,
+            C[None],
+            Q[None],
+            R[None],
+            np.ascontiguousarray(y[None]),
+            ~np.isnan(y[None]),
+            np.ascontiguousarray(state.x),
+            np.ascontiguousarray(state.P),
+            **more,
+        )
+        return Belief(
+            out["x"][0], out["P"][0], state.loglik + float(out["loglik"][0]), state.row + 1, int(out["code"][0])
+        )
+
+    def belief(self, model: Linear, state: "Belief") -> tuple[Array, Array, float]:  # noqa: ARG002
+        """Return mean, covariance and log-likelihood."""
+        return state.x, state.P, state.loglik
+
+
+class Belief(NamedTuple):
+    """What `KalmanFilter.step` hands on: moments, log-likelihood, the number of rows and the kernel's code."""
+
+    x: Array
+    P: Array
+    loglik: float
+    row: int
+    code: int
+
 
 @dataclass(frozen=True)
 class KalmanSmoother:
@@ -139,7 +180,7 @@ def not_gaussian(model: Model, name: str) -> str | None:
     if model.bounds is not None:
         return (
             f"`{name}` cannot keep states inside `bounds`\n"
-            "hint: use `model.as_gaussian()`, which drops them, or a method for bounded noise"
+            f"hint: use `Constrained({name}())`, or `model.as_gaussian()`, which drops them"
         )
     if model.loss is not None:
         return f"`{name}` takes every seen output as received but the model has `loss`\nhint: use `BKF2()` or `RBPF()`"
@@ -304,6 +345,21 @@ def _ended(code: int, row: int, record: Record) -> tuple[Status, dict[str, Any]]
     }
 
 
+def _folded(model: Linear, varying: Mapping[str, Varying], row: int, t: float, dt: float) -> tuple[Array, ...]:
+    """Return A, B, C, Q, R of one row, E and F folded in."""
+    for m in varying.values():
+        if m.value is not None and m.value.ndim == 3 and row >= len(m.value):
+            raise BadRecord(f"row {row} was pushed but `{m.name}` is stacked for {len(m.value)} rows")
+    M = {name: matrix.at(t, dt, row) for name, matrix in varying.items()}
+    A, B, C = M["A"], M.get("B", np.zeros((model.nx, 0))), M["C"]
+    Q, R = M["Q"], M["R"]
+    if "E" in M:
+        A, B, Q = _left(M["E"], A), _left(M["E"], B), _both(M["E"], Q)
+    if "F" in M:
+        C, R = _left(M["F"], C), _both(M["F"], R)
+    return tuple(np.ascontiguousarray(m) for m in (A, B, C, Q, R))
+
+
 def _stream(method: Any, model: Linear, t: float, lag: int) -> Any:
     x0 = model.x0
     assert isinstance(x0, Normal)
@@ -313,17 +369,7 @@ def _stream(method: Any, model: Linear, t: float, lag: int) -> Any:
     every_row = bool(stacked) or "t" in of
 
     def at(row: int, t: float, dt: float) -> tuple[Array, ...]:
-        for m in stacked:
-            if m.value is not None and row >= len(m.value):
-                raise BadRecord(f"row {row} was pushed but `{m.name}` is stacked for {len(m.value)} rows")
-        M = {name: matrix.at(t, dt, row) for name, matrix in varying.items()}
-        A, B, C = M["A"], M.get("B", np.zeros((model.nx, 0))), M["C"]
-        Q, R = M["Q"], M["R"]
-        if "E" in M:
-            A, B, Q = _left(M["E"], A), _left(M["E"], B), _both(M["E"], Q)
-        if "F" in M:
-            C, R = _left(M["F"], C), _both(M["F"], R)
-        return tuple(np.ascontiguousarray(m) for m in (A, B, C, Q, R))
+        return _folded(model, varying, row, t, dt)
 
     newest = type("NewestKalman", (Newest,), {"__slots__": (), "method": typed(method), "names": model.names.x})
 

@@ -110,7 +110,7 @@ class _LossMethod:
                 f"`{name}` needs a Gaussian prior but `x0` is a box\nhint: x0=Normal(mean, P), or `model.as_gaussian()`"
             )
         if model.bounds is not None:
-            return f"`{name}` knows no bounds on the state\nhint: leave `bounds` away"
+            return f"`{name}` knows no bounds on the state\nhint: Constrained({name}()), or leave `bounds` away"
         if isinstance(model, Linear) and model.theta_entries:
             return f"`{name}` needs a known model but it has unknown entries\nhint: put numbers in place of NaN"
         R = model.e.cov()

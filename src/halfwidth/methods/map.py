@@ -42,7 +42,7 @@ from halfwidth.methods._residuals import (
     residuals,
     unseen_directions,
 )
-from halfwidth.model import Linear, Model
+from halfwidth.model import Linear, Model, needs_a_box
 from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
@@ -169,6 +169,8 @@ class BatchLP:
                 return (
                     f"`BatchLP` needs uniform noise but `{name}` is `{kind}`\nhint: {name}=Uniform.unknown(at_most=...)"
                 )
+        if (reason := needs_a_box(model, type(self).__name__)) is not None:
+            return reason
         if not isinstance(model.x0, Box):
             return "`BatchLP` needs a box as prior but `x0` is `Normal`\nhint: x0=Box(lo, hi), or None for no bounds"
         if model.theta_entries:

@@ -205,7 +205,7 @@ def _refuses(method: Method, model: Model) -> str | None:
     if not isinstance(model.x0, Normal):
         return f"`{name}` needs a Gaussian prior but `x0` is a {type(model.x0).__name__}\nhint: x0=Normal(mean, P)"
     if model.bounds is not None:
-        return f"`{name}` cannot keep `bounds`\nhint: model.as_gaussian() drops them, ParticleFilter() keeps them"
+        return f"`{name}` cannot keep `bounds`\nhint: Constrained({name}()), or ParticleFilter()"
     if model.loss is not None:
         return f"`{name}` cannot tell losses from outputs\nhint: a model without `loss`, and NaN where y was lost"
     return None

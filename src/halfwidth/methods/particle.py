@@ -28,7 +28,7 @@ from halfwidth.model import Linear, Model, Nonlinear, arity
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.spread import Box, Cloud
+from halfwidth.spread import Box, Cloud, Halfspaces
 from halfwidth.trace import Untraceable, compiled
 
 #: Entries (rows x particles x states) up to which every particle is returned; beyond, each row is thinned.
@@ -84,6 +84,11 @@ class ParticleFilter:
         if isinstance(model, Linear) and model.theta_entries:
             return (
                 "`ParticleFilter` needs a known model but some entries are NaN\nhint: give every entry of A, B, C, E, F"
+            )
+        if isinstance(model.bounds, Halfspaces) and np.any(model.bounds.lo == model.bounds.hi):
+            return (
+                "`ParticleFilter` cannot keep an equality: no particle falls on it"
+                "\nhint: a Gaussian model and Constrained(KalmanFilter())"
             )
         if model.loss is not None:
             return "`ParticleFilter` cannot tell losses from outputs\nhint: RBPF(), or a model without `loss`"
@@ -206,8 +211,7 @@ def _wrapped(a: Array) -> Array:
 def _inside(model: Model, x: Array) -> Any:
     if model.bounds is None:
         return 0.0
-    good = ((x >= model.bounds.lo) & (x <= model.bounds.hi)).all(axis=1)
-    return np.where(good, 0.0, -np.inf)
+    return np.where(model.bounds.contains(x), 0.0, -np.inf)
 
 
 def _parts(noise: Noise) -> tuple[Array | None, Gaussian | None]:

@@ -29,7 +29,7 @@ from halfwidth.array import Array
 from halfwidth.errors import BadValue
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._residuals import reference, residuals
-from halfwidth.model import Entry, Linear, Model, Nonlinear
+from halfwidth.model import Entry, Linear, Model, Nonlinear, needs_a_box
 from halfwidth.noise import Gaussian, Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
@@ -107,6 +107,8 @@ class SequentialLP:
                 "`SequentialLP` takes lost outputs as NaN in the record but the model has a hidden loss"
                 "\nhint: loss=None"
             )
+        if (reason := needs_a_box(model, type(self).__name__)) is not None:
+            return reason
         if isinstance(model, Linear):
             if not isinstance(model.x0, Box):
                 return "`SequentialLP` needs a box as prior but `x0` is `Normal`\nhint: x0=Box(lo, hi), or None"

@@ -254,7 +254,8 @@ class Window:
                     changes[name] = matrix.value[a : t + 1]
             changes["dt"] = float(record.t[a] - record.t[a - 1]) if a else model.dt
         if a > 0 and isinstance(model.x0, Box):
-            box = model.bounds or Box(np.full(model.nx, -np.inf), np.full(model.nx, np.inf))
+            free = Box(np.full(model.nx, -np.inf), np.full(model.nx, np.inf))
+            box = model.bounds if isinstance(model.bounds, Box) else free
             bounds = self._interval(found, a, t)
             changes["x0"] = box if bounds is None else _meet(box, bounds)
         return replace(model, **changes)
@@ -644,7 +645,9 @@ class _Live:
         local = model
         if isinstance(model.x0, Box):
             free = Box(np.full(model.nx, -np.inf), np.full(model.nx, np.inf))
-            changes: dict[str, Any] = {} if first + a == 0 else {"x0": model.bounds or free}
+            changes: dict[str, Any] = {}
+            if first + a > 0:
+                changes["x0"] = model.bounds if isinstance(model.bounds, Box) else free
             gap = self.times[a] - (self.times[a - 1] if a else self.before)
             local = replace(model, dt=gap, **changes)
         est = self._solve(local, part)

@@ -18,15 +18,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from halfwidth.array import Array
+from halfwidth.methods.constrain import Constrained
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.sequential import SequentialLP
 from halfwidth.methods.window import Window, ensemble_interval, prediction_errors
 from halfwidth.model import Linear
-from halfwidth.noise import Uniform
+from halfwidth.noise import Gaussian, Uniform
 from halfwidth.record import Record
 from halfwidth.reproduce import Table
 from halfwidth.result import Estimate
-from halfwidth.spread import Box
+from halfwidth.spread import Box, Normal
 
 A = np.array([[1, -0.5, 0.2], [0.5, 0.1, 0], [0.3, 0, -0.1]])
 B = np.array([[0.1], [0.6], [0.3]])
@@ -160,38 +161,14 @@ def experiment(memory: int, seeds: range, *, unknown: bool, correlated: bool, ro
 def truncated_kalman(drawn: Drawn, factor: float) -> tuple[Array, Array]:
     """Run the truncated Kalman filter with `factor` times the true covariances: means (T, 3) and covariances.
 
-    After each correction every state's density is cut at its bounds and replaced by the normal one of the same mean and
-    variance (Simon and Simon 2010), one state after the other; the filter goes on from there.
+    After each correction the density is cut at the bounds and replaced by the normal one of the same mean and variance
+    (Simon and Simon 2010), one state after the other; the filter goes on from there.
     """
-    Sw, Se = factor * Q**2 / 3 * np.eye(3), factor * R**2 / 3 * np.eye(2)
-    x, P = np.zeros(3), 1e-6 * np.eye(3)
-    u = drawn.record.u
-    assert u is not None
-    means, covariances = np.empty((len(u), 3)), np.empty((len(u), 3, 3))
-    for t in range(len(u)):
-        x, P = A @ x + B @ u[t], A @ P @ A.T + Sw
-        gain = np.linalg.solve(C @ P @ C.T + Se, C @ P).T
-        x = x + gain @ (drawn.record.y[t] - C @ x)
-        left = np.eye(3) - gain @ C
-        P = left @ P @ left.T + gain @ Se @ gain.T
-        for i in range(3):
-            mean, variance = _cut(x[i], P[i, i], BOX.lo[i], BOX.hi[i])
-            column = P[:, i] / P[i, i]
-            x, P = x + column * (mean - x[i]), P + np.outer(column, column) * (variance - P[i, i])
-        means[t], covariances[t] = x, P
-    return means, covariances
-
-
-def _cut(mean: float, variance: float, lo: float, hi: float) -> tuple[float, float]:
-    """Return mean and variance of a normal density cut to [lo, hi]; the nearer bound where hardly any is left."""
-    sd = math.sqrt(variance)
-    a, b = (lo - mean) / sd, (hi - mean) / sd
-    mass = 0.5 * (math.erf(b / math.sqrt(2)) - math.erf(a / math.sqrt(2)))
-    if mass < 1e-6:
-        return float(np.clip(mean, lo, hi)), variance * 1e-3
-    pa, pb = (math.exp(-0.5 * v * v) / math.sqrt(2 * math.pi) for v in (a, b))
-    shift = (pa - pb) / mass
-    return mean + sd * shift, max(variance * (1 + (a * pa - b * pb) / mass - shift**2), 1e-9 * variance)
+    w, e = (Gaussian(factor * half**2 / 3) for half in (Q, R))
+    model = Linear(A, B, C, w, e, Normal(np.zeros(3), 1e-6), bounds=BOX)
+    est = Constrained(by="truncate", feedback=True).run(model, drawn.record)
+    assert est.P is not None
+    return est.x, est.P
 
 
 def table_one(*, quick: bool = False) -> Table:
