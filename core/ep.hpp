@@ -128,7 +128,7 @@ struct EpFound {
     V log_z;      // evidence
     V* slope;     // (groups + 1,): d log Z / d log s, d log Z / d logit eps
     V* learned;   // (groups,): sum over the rows of a half-width of (1 - posterior / prior variance)^2
-    V worst;      // smallest log Z of a site
+    V worst;      // smallest log of the share of a cavity that lies in its factor's box
     V far;        // largest squared distance of a site's mean from its cavity's, in the cavity's variances
 };
 
@@ -356,7 +356,7 @@ struct Ep {
                 }
             } else {
                 f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], mu, c);
-                f.worst = smaller(f.worst, of(q.log_z));
+                f.worst = smaller(f.worst, of(q.log_z) + unit(k));
                 slopes(k, q, v, f);
                 if (cross.S) ratios(shape(k, mu, c), v, cross.r3 + k, cross.r4 + k);
                 if (a.out) {
@@ -365,6 +365,11 @@ struct Ep {
                 }
             }
         }
+    }
+
+    // log of the width of a row's box: with it the log of a density becomes that of a share
+    inline V unit(int k) const {
+        return kind(k) != ep_truncation && a.group[k] >= 0 ? of(log4(2.0 * s.s[a.group[k]].v + 1e-300)) : V(0.0);
     }
 
     inline void slopes(int k, const Tilted4& q, const V& v, EpFound& f) const {
@@ -747,7 +752,7 @@ struct Ep {
             } else {
                 const V spread = D[i] + c, d = m[i] - mu;
                 f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + of(log4(spread.v)) + d * d / spread);
-                f.worst = smaller(f.worst, of(q.log_z));
+                f.worst = smaller(f.worst, of(q.log_z) + of(log4(2.0 * half.v)));
                 if (t > 0) {
                     const V share = larger(V(1.0) - V(3.0) * D[i] * (V(1.0) - D[i] * know) / (half * half), V(0.0));
                     f.slope[a.group_w[i]] += of(q.slope_s);

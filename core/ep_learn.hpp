@@ -224,6 +224,7 @@ struct EpLearner {
             if (value[0] == minus_inf) return 2;
             refused = 0;
             *best = value[0];
+            *a.log_prior = log_prior(trial, 0);
             for (int j = 0; j < q; j++) {
                 phi[j] = trial[j];
                 g[j] = slope[0][j];
@@ -322,6 +323,7 @@ struct EpLearner {
         const EpCross wanted = ep.cross;
         ep.cross = EpCross{};
         double best = minus_inf;
+        *a.log_prior = 0.0;
         int code = 0;
         if (q > 0) {
             code = climb(phi, H, &best, warm);
@@ -416,7 +418,11 @@ struct EpLearner {
         if (!(sum > 0.0)) return 2;
         finish(sum);
         double half_log_det = 0.0;
-        for (int j = 0; j < q; j++) half_log_det += std::log(L[j][j]) - (group[j] >= 0 ? a.warp * phi[j] : 0.0);
+        for (int j = 0; j < q; j++) {
+            const double to_phi = group[j] >= 0 ? a.warp * phi[j] : 0.0;
+            half_log_det += std::log(L[j][j]) - to_phi;
+            *a.log_prior += to_phi;
+        }
         *a.log_evidence = nodes > 1 ? top + std::log(sum / nodes) - half_log_det
                                     : top + 0.5 * q * log_2pi - half_log_det;
         *a.sweeps_used = sweeps;

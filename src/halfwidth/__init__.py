@@ -23,6 +23,7 @@ _HOME: dict[str, str] = {
     "Halfspaces": "spread",
     "Normal": "spread",
     "Cloud": "spread",
+    "Shaped": "spread",
     "Bernoulli": "loss",
     "Markov": "loss",
     "Linear": "model",
@@ -92,6 +93,7 @@ if TYPE_CHECKING:
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
+    from halfwidth.methods.posterior import Posterior as Posterior
     from halfwidth.methods.sequential import SequentialLP as SequentialLP
     from halfwidth.methods.window import MemoryChoice as MemoryChoice
     from halfwidth.methods.window import Window as Window
@@ -111,6 +113,7 @@ if TYPE_CHECKING:
     from halfwidth.spread import Cloud as Cloud
     from halfwidth.spread import Halfspaces as Halfspaces
     from halfwidth.spread import Normal as Normal
+    from halfwidth.spread import Shaped as Shaped
     from halfwidth.stream import resume as resume
     from halfwidth.stream import stream as stream
 

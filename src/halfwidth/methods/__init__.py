@@ -20,6 +20,7 @@ ESTIMATORS: dict[str, str] = {
     "BatchLP": "map",
     "SequentialLP": "sequential",
     "Window": "window",
+    "Posterior": "posterior",
     "Constrained": "constrain",
 }
 
