@@ -281,11 +281,12 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     nb::object centre = fresh({stages, n}, &l.centre);
     found["out"] = nb::none();
     if (outliers) found["out"] = fresh({rows}, &l.out);
-    double log_evidence = 0.0, log_prior = 0.0, residual = 0.0;
+    double log_evidence = 0.0, log_prior = 0.0, log_mode = 0.0, residual = 0.0;
     std::int32_t used = 0;
     long sweeps = 0;
     l.log_evidence = &log_evidence;
     l.log_prior = &log_prior;
+    l.log_mode = &log_mode;
     l.residual = &residual;
     l.used = &used;
     l.sweeps_used = &sweeps;
@@ -300,6 +301,7 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     found["code"] = code;
     found["log_evidence"] = log_evidence;
     found["log_prior"] = log_prior;
+    found["log_mode"] = log_mode;
     found["residual"] = residual;
     found["nodes"] = used;
     found["sweeps"] = sweeps;

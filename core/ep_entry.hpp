@@ -74,7 +74,7 @@ struct EpLearnArgs {
     // found
     double *mode, *H, *phi, *log_weight;     // (q,), (q,q), (nodes,q), (nodes,)
     double *x, *P, *k3, *k4, *centre, *out;  // (T+1,n), (T+1,n,n), ...: of the mixture; out (rows,) or null
-    double *log_evidence, *log_prior, *residual;  // of the data; of phi at the mode
+    double *log_evidence, *log_mode, *log_prior, *residual;  // of the data; Z times prior, and the prior, at the mode
     std::int32_t* used;                      // nodes
     long* sweeps_used;
 };

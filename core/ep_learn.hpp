@@ -422,7 +422,9 @@ struct EpLearner {
             const double to_phi = group[j] >= 0 ? a.warp * phi[j] : 0.0;
             half_log_det += std::log(L[j][j]) - to_phi;
             *a.log_prior += to_phi;
+            best += to_phi;
         }
+        *a.log_mode = best;
         *a.log_evidence = nodes > 1 ? top + std::log(sum / nodes) - half_log_det
                                     : top + 0.5 * q * log_2pi - half_log_det;
         *a.sweeps_used = sweeps;
