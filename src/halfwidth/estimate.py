@@ -18,6 +18,7 @@ DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("KalmanSmoother", {}),
     ("UnscentedKalman", {"smooth": True}),
     ("GPB", {"depth": 5, "smooth": True}),
+    ("Posterior", {}),
     ("BatchLP", {}),
     ("ParticleFilter", {}),
 )

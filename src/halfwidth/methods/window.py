@@ -46,7 +46,7 @@ from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.solvers.banded import POINTS, Chain, chain_of, solve
-from halfwidth.spread import Box
+from halfwidth.spread import Box, Cloud, Normal, Shaped, Spread
 
 _STATUS = (Status.OK, Status.REDUCED, Status.INFEASIBLE, Status.STALLED)
 #: Rows, in units of the window, from which the scales of `SequentialLP` are found.
@@ -239,8 +239,7 @@ class Window:
                 s = np.r_[est.q, est.r]
             theta = np.zeros(0) if est.theta is None else est.theta
             found.take(t, a, x, theta, s, est.status, int(est.info.get("iterations", 0) or 0), self.memory)
-            if isinstance(est.spread, Box):
-                found.spread_lo[t], found.spread_hi[t] = est.spread.lo[-1], est.spread.hi[-1]
+            found.spreads.append(newest(est.spread))
         return found
 
     def _local(self, model: Model, record: Record, found: "_Found", a: int, t: int) -> Model:
@@ -312,9 +311,7 @@ class Window:
             info["message"] = f"{worst.value}: {len(unsolved)} of {T} windows, the first at row {unsolved[0]}"
         if np.any(since > 0) and "message" not in info:
             info["message"] = f"{worst.value}; {int(np.count_nonzero(since > 0))} rows extrapolate beyond the last fix"
-        spread = None
-        if np.isfinite(found.spread_lo).all() and not np.isnan(found.spread_lo).any():
-            spread = Box(found.spread_lo, found.spread_hi)
+        spread = _stacked(found.spreads) if len(found.spreads) == T else None
         theta = found.theta[-1] if found.theta is not None and found.theta.shape[1] else None
         s = found.s[-1]
         known = np.isfinite(s).all() and found.statuses[-1].good
@@ -346,8 +343,7 @@ class _Found:
     iterations: NDArray[np.int_]
     theta: Array | None = None
     seconds: Array | None = None
-    spread_lo: Array = dataclasses.field(default_factory=lambda: np.full((1, 1), np.nan))
-    spread_hi: Array = dataclasses.field(default_factory=lambda: np.full((1, 1), np.nan))
+    spreads: list[Spread | None] = dataclasses.field(default_factory=list)
 
     @classmethod
     def empty(cls, T: int, nx: int, groups: int, p: int) -> "_Found":
@@ -360,9 +356,6 @@ class _Found:
             [Status.OK] * T,
             np.zeros(T, dtype=int),
             np.full((T, p), np.nan),
-            None,
-            np.full((T, nx), np.nan),
-            np.full((T, nx), np.nan),
         )
 
     def take(
@@ -466,6 +459,40 @@ def first_costs(model: Linear, record: Record, rows: int) -> Array:
 def shares_costs(method: Estimator, model: Model) -> bool:
     """Say whether all windows of a method are given the scales of the first full one."""
     return isinstance(method, BatchLP) and method.objective == "scaled" and isinstance(model, Linear)
+
+
+def newest(spread: Spread | None) -> Spread | None:
+    """Return what is known of the last row alone."""
+    if isinstance(spread, Box):
+        return Box(spread.lo[-1:], spread.hi[-1:], guaranteed=spread.guaranteed)
+    if isinstance(spread, Normal):
+        return Normal.of(spread.mean[-1:], spread.P[-1:], spread._within)
+    if isinstance(spread, Shaped):
+        return Shaped(spread.mean[-1:], spread.P[-1:], spread.skew[-1:], spread.kurt[-1:], spread.within)
+    if isinstance(spread, Cloud):
+        return Cloud(spread.points[-1:], spread.weights[-1:])
+    return None
+
+
+def _stacked(spreads: list[Spread | None]) -> Spread | None:
+    """Return the spreads of single rows as one, None where they differ in kind."""
+    first = spreads[0]
+    if isinstance(first, Box) and all(isinstance(s, Box) for s in spreads):
+        lo, hi = (np.concatenate([getattr(s, end) for s in spreads]) for end in ("lo", "hi"))
+        return Box(lo, hi, guaranteed=all(s is not None and s.guaranteed for s in spreads))
+    if all(isinstance(s, Normal | Shaped) for s in spreads):
+        bent = [s if isinstance(s, Shaped) else _unbent(s) for s in spreads]
+        columns = [np.concatenate([getattr(s, f) for s in bent]) for f in ("mean", "P", "skew", "kurt")]
+        return Shaped(*columns, bent[-1].within)
+    if isinstance(first, Cloud) and all(isinstance(s, Cloud) for s in spreads):
+        points, weights = (np.concatenate([getattr(s, f) for s in spreads]) for f in ("points", "weights"))
+        return Cloud(points, weights)
+    return None
+
+
+def _unbent(spread: Any) -> Shaped:
+    none = np.zeros(spread.mean.shape)
+    return Shaped(spread.mean, spread.P, none, none, spread._within)
 
 
 def window_estimate(
@@ -663,7 +690,7 @@ class _Live:
             est,
             t=est.t[-1:],
             x=est.x[-1:],
-            spread=None,
+            spread=newest(est.spread),
             method=self.method,
             info=info | {"extrapolated": since > 0, "since_fix": since, "rows": len(part)},
         )
