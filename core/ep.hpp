@@ -301,7 +301,8 @@ struct Ep {
     }
 
     static inline void note(EpFound& f, const V& mean, const V& var, const Tilted4& t, const V& mu, const V& c) {
-        const V tv = larger(of(t.var), V(1e-300)), off = of(t.mean) - mu;
+        // a site never widens a belief: a factor that would is asked for its mean only
+        const V tv = larger(smaller(of(t.var), c), V(1e-300)), off = of(t.mean) - mu;
         f.far = larger(f.far, off * off / larger(c, V(1e-300)));
         const V d = of(t.mean) - mean, e = magnitude(tv - var) / tv;
         f.residual = larger(f.residual, larger(of(sqrt4((d * d / tv).v)), e));

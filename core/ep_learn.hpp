@@ -401,22 +401,24 @@ struct EpLearner {
                     for (std::ptrdiff_t i = 0; i < size; i++) a.centre[i] = b.x[l * size + i];
                     first = false;
                 }
-                *a.residual = max2(*a.residual, f.residual[l]);
                 if (lw > top) {
                     if (sum > 0) {
                         const double by = std::exp(top - lw);
                         scale_sums(by);
                         sum *= by;
+                        *a.residual *= by;
                     }
                     top = lw;
                 }
                 const double w = std::exp(lw - top);
                 sum += w;
+                *a.residual += w * f.residual[l];
                 add(l, w);
             }
         }
         if (!(sum > 0.0)) return 2;
         finish(sum);
+        *a.residual /= sum;
         double half_log_det = 0.0;
         for (int j = 0; j < q; j++) {
             const double to_phi = group[j] >= 0 ? a.warp * phi[j] : 0.0;

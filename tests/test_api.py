@@ -7,10 +7,10 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud Constrained DataQualityWarning Estimate
-Estimator ExtendedKalman FearnheadClifford GPB Gaussian Halfspaces HalfwidthError KalmanFilter KalmanSmoother Learned Linear
-LogTooBig Markov MemoryChoice Missing Mixed Nonlinear Normal ParticleFilter RBPF Record Recursive Refused Runnalls
-SequentialLP Status Uniform UnscentedKalman Unsolved Window __version__ choose_memory ensemble_interval estimate
+BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud Comparison Constrained
+DataQualityWarning Estimate Estimator ExtendedKalman FearnheadClifford GPB Gaussian Halfspaces HalfwidthError KalmanFilter KalmanSmoother Learned Linear
+LogTooBig Markov MemoryChoice Missing Mixed Nonlinear Normal ParticleFilter Posterior RBPF Record Recursive Refused Runnalls
+SequentialLP Shaped Status Uniform UnscentedKalman Unsolved Window __version__ choose_memory compare ensemble_interval estimate
 forecast from_continuous learn resume score simulate stream
 """
 

@@ -41,6 +41,8 @@ _HOME: dict[str, str] = {
     "ensemble_interval": "methods.window",
     "choose_memory": "methods.window",
     "MemoryChoice": "methods.window",
+    "compare": "methods.choose",
+    "Comparison": "methods.choose",
     "learn": "learn",
     "Learned": "learn",
     "HalfwidthError": "errors",
@@ -80,6 +82,8 @@ if TYPE_CHECKING:
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
     from halfwidth.methods.constrain import Constrained as Constrained
+    from halfwidth.methods.choose import Comparison as Comparison
+    from halfwidth.methods.choose import compare as compare
     from halfwidth.methods.kalman import KalmanFilter as KalmanFilter
     from halfwidth.methods.kalman import KalmanSmoother as KalmanSmoother
     from halfwidth.methods.loss import BKF1 as BKF1

@@ -49,6 +49,8 @@ _LIMITS = {
 }  # fmt: skip
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
+#: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
+_MIXED = {"most": 12, "damping": 0.5}
 #: Moments that agree this well, in standard deviations, are good, and good enough to be used.
 _FINE, _USABLE = 0.01, 0.1
 #: Fewer effective nodes than this leave an integral over half-widths rough.
@@ -80,7 +82,7 @@ class Posterior:
     prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
     count as a factor, not as a condition. In ``info``: ``x0``; ``half_widths``, a mapping with ``mean``, ``sd``, ``lo``
     and ``hi`` (5 and 95 %) of (q, r); ``outliers``, the named outputs with a probability above one half; ``residual``,
-    the largest disagreement of moments in standard deviations; ``sweeps``; ``nodes`` and their ``effective`` number.
+    the disagreement of moments in standard deviations, the largest of each node; ``sweeps``; ``nodes`` and their ``effective`` number.
 
     Raises
     ------
@@ -186,6 +188,8 @@ class Posterior:
         limits = dict(_LIMITS)
         if q == 0:
             limits |= _KNOWN | {"most": self.sweeps}
+        if rate > 0 and q:
+            limits |= _MIXED
         if chain.exact:
             limits["most"] = 1
         return dict(
