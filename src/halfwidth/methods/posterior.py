@@ -21,14 +21,14 @@ Perturbative corrections for approximate inference in Gaussian latent variable m
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.errors import BadValue
+from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Sites, gaussian_part, sites, uniform_part
@@ -47,6 +47,11 @@ _LIMITS = {
     "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.25, "least": 0.3,
     "narrow": 0.03, "damping": 0.7, "warp": _WARP, "reference": 1.0,
 }  # fmt: skip
+#: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
+#: with them; there is less left to integrate.
+_LONG = 2000
+_FIRST = 400
+_OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
@@ -172,6 +177,17 @@ class Posterior:
     def answer(self, model: Linear, record: Record, *, start: "Start | None" = None) -> "Answer":
         """Return the estimate of a model without unknown entries, and what the next one may start from."""
         problem = sites(model, record, outliers=self.outliers is not False and self.outliers != 0)
+        if start is None and len(record) > 2 * _FIRST and problem.free.any():
+            # The first rows alone say where to look.
+            cut = {k: v.value[:_FIRST] for k, v in model.matrices.items() if v.value is not None and v.value.ndim == 3}
+            short: Linear = replace(model, **cut) if cut else model  # type: ignore[arg-type]
+            first = Record(record.t[:_FIRST], record.y[:_FIRST], None if record.u is None else record.u[:_FIRST])
+            try:
+                quick = replace(self, nodes=1).answer(short, first)
+            except BadShape:  # a noise stacked row by row
+                quick = None
+            if quick is not None and int(quick.found["code"]) < 2:
+                start = Start(np.where(quick.chain.free, quick.start.s, math.sqrt(3.0) * problem.scale), None)
         found = self._solve(problem, model, start)
         return Answer(self._estimate(problem, found, model, record), problem, found)
 
@@ -182,10 +198,15 @@ class Posterior:
         sites_, was = None, None
         if start is not None:
             first = np.where(chain.free, np.clip(start.s, chain.floor, chain.cap), first)
-            sites_, was = start.sites, first
+            sites_, was = start.sites, first if start.sites is not None else None
         q = int(chain.free.sum()) + learn_rate
         z, log_proposal = nodes(q, self.nodes if q else 1)
         limits = dict(_LIMITS)
+        rows = max(float(chain.count.sum()), 1.0)
+        limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
+        limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
+        if rows > _LONG:
+            limits |= _OF_LONG
         if q == 0:
             limits |= _KNOWN | {"most": self.sweeps}
         if rate > 0 and q:
@@ -222,7 +243,8 @@ class Posterior:
         info: dict[str, Any] = {"notes": []}
         widths = _Widths.of(chain, found) if sound else _Widths.none(chain)
         if sound:
-            few = found["nodes"] > 1 and widths.effective < _FEW
+            one = found["nodes"] == 1 and found["mode"].size > 0
+            few = code == 1 if one else found["nodes"] > 1 and widths.effective < _FEW
             status = Status.STALLED if residual > _USABLE else Status.REDUCED if residual > _FINE or few else Status.OK
         loglik: float | None = None
         if sound:
