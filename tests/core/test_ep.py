@@ -80,7 +80,9 @@ def test_slopes_with_unseen_correlated_outputs_and_mixed_noise():
     r = [0.5, 0.6, 0.7]
     F = [[1, 0.4, -0.3], [0, 1, 0.5], [0, 0, 1]]
     for e in (hw.Uniform(r), hw.Uniform(r) + hw.Gaussian([0.1, 0.2, 0.1])):
-        model = hw.Linear(0.5 * np.eye(2), None, rng.standard_normal((3, 2)), hw.Uniform(0.4), e, hw.Box(-1, [1, 1]), F=F)
+        model = hw.Linear(
+            0.5 * np.eye(2), None, rng.standard_normal((3, 2)), hw.Uniform(0.4), e, hw.Box(-1, [1, 1]), F=F
+        )
         _, record = hw.simulate(model, T=8, seed=2)
         y = record.y.copy()
         y[rng.random(y.shape) < 0.3] = np.nan

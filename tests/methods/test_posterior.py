@@ -81,7 +81,9 @@ def test_intervals_cover_what_they_say():
     for seed in range(40):
         truth, record = drawn(26, 100 + seed)
         est = hw.estimate(paper(UNKNOWN, UNKNOWN), record, hw.Posterior())
-        inside.append([((truth >= lo) & (truth <= hi)).mean() for lo, hi in (est.interval(p) for p in (0.5, 0.8, 0.95))])
+        inside.append(
+            [((truth >= lo) & (truth <= hi)).mean() for lo, hi in (est.interval(p) for p in (0.5, 0.8, 0.95))]
+        )
     np.testing.assert_allclose(np.mean(inside, axis=0), [0.5, 0.8, 0.95], atol=0.06)
 
 
@@ -111,7 +113,9 @@ def test_losses_are_found():
     assert est.gamma.shape == record.y.shape
     assert np.abs(est.x - truth).mean() < 0.8 * np.abs(blind.x - truth).mean()
     learned = hw.estimate(
-        dataclasses.replace(model, loss=hw.Bernoulli.unknown(0.5, noise=4.0, sensors=[[0], [1]])), record, hw.Posterior()
+        dataclasses.replace(model, loss=hw.Bernoulli.unknown(0.5, noise=4.0, sensors=[[0], [1]])),
+        record,
+        hw.Posterior(),
     )
     assert learned.info["rate"] == pytest.approx(0.2, abs=0.08)
 
