@@ -24,6 +24,7 @@ _HOME: dict[str, str] = {
     "Normal": "spread",
     "Both": "spread",
     "Cloud": "spread",
+    "Shaped": "spread",
     "Bernoulli": "loss",
     "Markov": "loss",
     "Linear": "model",
@@ -43,6 +44,8 @@ _HOME: dict[str, str] = {
     "Bound": "methods._functional",
     "choose_memory": "methods.memory",
     "MemoryChoice": "methods.memory",
+    "compare": "methods.choose",
+    "Comparison": "methods.choose",
     "learn": "learn",
     "Learned": "learn",
     "HalfwidthError": "errors",
@@ -83,6 +86,8 @@ if TYPE_CHECKING:
     from halfwidth.methods._functional import Bound as Bound
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
+    from halfwidth.methods.choose import Comparison as Comparison
+    from halfwidth.methods.choose import compare as compare
     from halfwidth.methods.constrain import Constrained as Constrained
     from halfwidth.methods.hull import Hull as Hull
     from halfwidth.methods.kalman import KalmanFilter as KalmanFilter
@@ -102,6 +107,7 @@ if TYPE_CHECKING:
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
+    from halfwidth.methods.posterior import Posterior as Posterior
     from halfwidth.methods.sequential import SequentialLP as SequentialLP
     from halfwidth.methods.sets import ConstrainedZonotopeFilter as ConstrainedZonotopeFilter
     from halfwidth.methods.sets import EllipsoidFilter as EllipsoidFilter
@@ -124,6 +130,7 @@ if TYPE_CHECKING:
     from halfwidth.spread import Cloud as Cloud
     from halfwidth.spread import Halfspaces as Halfspaces
     from halfwidth.spread import Normal as Normal
+    from halfwidth.spread import Shaped as Shaped
     from halfwidth.stream import resume as resume
     from halfwidth.stream import stream as stream
 

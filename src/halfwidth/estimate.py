@@ -19,6 +19,7 @@ DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("Hull", {}),
     ("UnscentedKalman", {"smooth": True}),
     ("GPB", {"depth": 5, "smooth": True}),
+    ("Posterior", {}),
     ("BatchLP", {}),
     ("MixedFilter", {}),
     ("ParticleFilter", {}),

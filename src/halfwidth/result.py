@@ -7,12 +7,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from halfwidth.array import Array
-from halfwidth.errors import Refused, Unsolved
+from halfwidth.array import Array, real
+from halfwidth.errors import BadShape, Refused, Unsolved
 from halfwidth.record import Labels
-from halfwidth.spread import Normal, Spread
+from halfwidth.spread import Normal, Shaped, Spread
 
 
 class Status(enum.Enum):
@@ -40,7 +40,7 @@ class Estimate:
         Times of the record, s.
     x : (T, nx) array
         Point estimate of the state.
-    spread : Box, Normal, Both or Cloud, or None
+    spread : Box, Normal, Shaped, Both or Cloud, or None
         What is known beside the point.
     status : Status
     method : str
@@ -82,22 +82,35 @@ class Estimate:
 
     @property
     def P(self) -> NDArray[np.float64] | None:
-        """Covariance of the state (T, nx, nx) where the spread is Gaussian, else None."""
-        return self.spread.P if isinstance(self.spread, Normal) else None
+        """Covariance of the state (T, nx, nx) where the spread has one, else None."""
+        return self.spread.P if isinstance(self.spread, Normal | Shaped) else None
 
-    def interval(self, level: float = 0.9) -> tuple[Array, Array]:
+    def interval(self, level: float = 0.9, *, of: ArrayLike | None = None) -> tuple[Array, Array]:
         """Return ``(lo, hi)``, each (T, nx), that holds the state with probability `level`.
 
         A guaranteed box is the same at every level.
+
+        Parameters
+        ----------
+        level : float
+        of : (k, nx) or (nx,) array_like, optional
+            Linear functionals of the state, one a row: the ends are then those of ``of @ x``, each (T, k).
 
         Raises
         ------
         Refused
             If the method gives a point only.
+        BadShape
+            If `of` does not fit the state.
         """
         if self.spread is None:
             raise Refused(f"`{self.method}` gives a point without a spread, so there is no interval")
-        return self.spread.interval(level)
+        if of is None:
+            return self.spread.interval(level)
+        D = np.atleast_2d(real(of, "of"))
+        if D.ndim != 2 or D.shape[1] != self.x.shape[1]:
+            raise BadShape(f"`of` has shape {np.shape(of)}, (k, {self.x.shape[1]}) was expected: one functional a row")
+        return self.spread.through(D).interval(level)
 
     def check(self) -> "Estimate":
         """Return the estimate itself.

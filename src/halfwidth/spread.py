@@ -26,6 +26,10 @@ class Spread(Protocol):
         """Return (lo, hi), each shaped as the state."""
         ...
 
+    def through(self, D: Array) -> "Spread":
+        """Return what is known of ``D x``, D of shape (k, nx)."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class Box:
@@ -94,6 +98,14 @@ class Box:
         """Return the box itself, whatever the level."""
         _level(level)
         return self.lo, self.hi
+
+    def through(self, D: Array) -> "Box":
+        """Return what is known of ``D x``."""
+        plus, minus = np.maximum(D, 0.0), np.minimum(D, 0.0)
+        with np.errstate(invalid="ignore"):
+            lo = np.nansum(plus * self.lo[..., None, :], axis=-1) + np.nansum(minus * self.hi[..., None, :], axis=-1)
+            hi = np.nansum(plus * self.hi[..., None, :], axis=-1) + np.nansum(minus * self.lo[..., None, :], axis=-1)
+        return Box(lo, hi, guaranteed=self.guaranteed)
 
     def sample(self, rng: np.random.Generator) -> Array:
         """Draw one state uniformly; a side without end is refused."""
@@ -233,6 +245,10 @@ class Normal:
             lo, hi = np.clip(lo, *self._within), np.clip(hi, *self._within)
         return lo, hi
 
+    def through(self, D: Array) -> "Normal":
+        """Return what is known of ``D x``; bounds of the state are left out."""
+        return Normal.of(self.mean @ D.T, D @ self.P @ D.T)
+
     def sample(self, rng: np.random.Generator) -> Array:
         """Draw one state (nx,)."""
         return rng.multivariate_normal(self.mean, self.P, method="eigh")
@@ -316,6 +332,66 @@ def biased_quantile(bias: Array, level: float) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
+class Shaped:
+    """The state has these moments: a Gaussian bent by skewness and kurtosis.
+
+    Quantiles follow from the moments by the expansion of Cornish and Fisher (1938).
+
+    Parameters
+    ----------
+    mean : (T, nx) array
+    P : (T, nx, nx) array
+        Covariance.
+    skew, kurt : (T, nx) arrays
+        Third and fourth standardised cumulants of each entry; 0 for a Gaussian.
+    within : tuple of arrays or None
+        (lo, hi) that every state is known to lie in: intervals end there.
+    """
+
+    mean: Array
+    P: Array
+    skew: Array
+    kurt: Array
+    within: tuple[Array, Array] | None = None
+    guaranteed = False
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations."""
+        return np.asarray(np.sqrt(np.diagonal(self.P, axis1=-2, axis2=-1)))
+
+    def interval(self, level: float = 0.9) -> tuple[Array, Array]:
+        """Return the quantiles that leave the same probability outside on either side, each (T, nx)."""
+        from statistics import NormalDist
+
+        top = NormalDist().inv_cdf(0.5 + 0.5 * _level(level))
+        a, b = np.clip(self.skew, -1.0, 1.0), np.clip(self.kurt, -1.2, 4.0)
+        lo, hi = np.full(self.mean.shape, np.inf), np.full(self.mean.shape, -np.inf)
+        # Far out the expansion may turn back; a wider level never gives a narrower interval.
+        for z in np.linspace(0.0, top, 9):
+            for sign in (-1.0, 1.0):
+                q = sign * z
+                bent = q + (q**2 - 1) * a / 6 + (q**3 - 3 * q) * b / 24 - (2 * q**3 - 5 * q) * a**2 / 36
+                lo, hi = np.minimum(lo, bent), np.maximum(hi, bent)
+        lo, hi = self.mean + self.sd * lo, self.mean + self.sd * hi
+        if self.within is not None:
+            lo, hi = np.clip(lo, *self.within), np.clip(hi, *self.within)
+        return lo, hi
+
+    def through(self, D: Array) -> "Shaped":
+        """Return what is known of ``D x``; third and fourth cumulants add as those of independent entries do."""
+        P = D @ self.P @ D.T
+        sd = np.sqrt(np.maximum(np.diagonal(P, axis1=-2, axis2=-1), 1e-300))
+        share = D * self.sd[..., None, :] / sd[..., None]
+        return Shaped(
+            self.mean @ D.T,
+            P,
+            np.asarray((share**3 @ self.skew[..., None])[..., 0]),
+            np.asarray((share**4 @ self.kurt[..., None])[..., 0]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Cloud:
     """The state is spread as weighted points.
 
@@ -334,6 +410,10 @@ class Cloud:
     def mean(self) -> Array:
         """Weighted mean, (T, nx)."""
         return np.asarray(np.einsum("tn,tni->ti", self.weights, self.points))
+
+    def through(self, D: Array) -> "Cloud":
+        """Return what is known of ``D x``."""
+        return Cloud(self.points @ D.T, self.weights)
 
     def interval(self, level: float = 0.9) -> tuple[Array, Array]:
         """Return the weighted quantiles that leave the same weight outside on either side, each (T, nx)."""

@@ -42,8 +42,8 @@ def test_a_box_equals_quadrature(kind, avx2):
             got, want = truncated(mu, c, lo, hi), naive.truncated(mu, c, lo, hi)
             sd = math.sqrt(want[2])
             assert got[0] == pytest.approx(want[0], rel=1e-13, abs=1e-13)
-            assert abs(got[1] - want[1]) < 1e-12 * sd + 4e-16 * abs(want[1])
-            assert got[2] == pytest.approx(want[2], rel=1e-11)
+            assert abs(got[1] - want[1]) < 1e-10 * sd + 4e-16 * abs(want[1])
+            assert got[2] == pytest.approx(want[2], rel=1e-10)
             density = want[3] + want[4]
             if 1e-300 < density < math.inf:
                 assert abs(got[3] - want[3]) + abs(got[4] - want[4]) < 1e-12 * density
@@ -58,7 +58,7 @@ def test_lanes_do_not_meet():
     cases = np.array([boxes(rng, "any") for _ in range(23)])
     together = _core.noise_truncated(*np.ascontiguousarray(cases.T))
     for k, case in enumerate(cases):
-        np.testing.assert_array_equal([float(v[k]) for v in together], truncated(*case))
+        np.testing.assert_allclose([float(v[k]) for v in together], truncated(*case), rtol=1e-10)
 
 
 EDGES = [

@@ -21,6 +21,7 @@ ESTIMATORS: dict[str, str] = {
     "SequentialLP": "sequential",
     "Window": "window",
     "Hull": "hull",
+    "Posterior": "posterior",
     "Constrained": "constrain",
     "MixedFilter": "mixed",
     "MixedWindow": "mixed_window",

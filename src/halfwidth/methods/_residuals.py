@@ -19,6 +19,7 @@ Pavelková (2011), ÚTIA report 2296, eqs. (7), (8), (14), (18); Pavelková and 
 Redundancy and variance components: Förstner (1979), Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -224,15 +225,25 @@ def reference(rows: Residuals, model: Linear, known: Array) -> Reference:
 
 
 def _first_scales(rows: Residuals, model: Linear) -> Array:
+    nx = rows.nx
+    return first_scales(model, [rows.b[rows.group == nx + j] for j in range(rows.ny)])
+
+
+def first_scales(model: Linear, seen: Sequence[Array]) -> Array:
     """Return a first scale of each group (p,) that follows the unit of its state or output.
 
     An output's is its typical step from one seen row to the next; a state's is the disturbance that moves the outputs
     of the next rows by one such step.
+
+    Parameters
+    ----------
+    model : Linear
+    seen : sequence of arrays
+        The seen values of each output, in order.
     """
-    nx, ny = rows.nx, rows.ny
+    nx, ny = model.nx, model.ny
     sigma = np.ones(nx + ny)
-    for j in range(ny):
-        y = rows.b[rows.group == nx + j]
+    for j, y in enumerate(seen):
         step = np.abs(np.diff(y))
         for level in (np.mean(step) if step.size else 0.0, np.std(y) if y.size else 0.0):
             if level > 0:
@@ -247,7 +258,7 @@ def _first_scales(rows: Residuals, model: Linear) -> Array:
 
     inverse = np.linalg.inv(typical(model.E, nx))
     Phi = inverse @ typical(model.A, nx)
-    H = typical(model.C, nx) / sigma[nx:, None] * (rows.count[nx:, None] > 0)
+    H = typical(model.C, nx) / sigma[nx:, None] * np.array([[len(y) > 0] for y in seen])
     # A model that grows is discounted by its growth: what a disturbance does after many rows says nothing of its size.
     growth = max(1.0, float(np.abs(np.linalg.eigvals(Phi)).max(initial=0.0)))
     gram, step, keep = np.zeros((nx, nx)), inverse, 1.0

@@ -39,7 +39,7 @@ from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.solvers.banded import Start, chain_of, solve
-from halfwidth.spread import Box
+from halfwidth.spread import Both, Box, Cloud, Normal, Shaped, Spread
 
 if TYPE_CHECKING:
     from halfwidth.methods.window import Window
@@ -57,7 +57,7 @@ class Solved(NamedTuple):
     status: Status
     iterations: int
     info: dict[str, Any]
-    spread: tuple[Array, Array] | None = None
+    spread: Spread | None = None
 
 
 class Forecasts:
@@ -214,10 +214,9 @@ class Sliding:
         est = method.run(model, part, seed=self.seed)
         s = np.full(model.nx + model.ny, np.nan) if est.q is None or est.r is None else np.r_[est.q, est.r]
         info = {k: v for k, v in est.info.items() if k in ("solver", "objective", "notes", "message", "gap")}
-        spread = (est.spread.lo[-1], est.spread.hi[-1]) if isinstance(est.spread, Box) else None
         return Solved(
             np.vstack([est.info.get("x0", self.x[a]), est.x]), np.zeros(0) if est.theta is None else est.theta, s,
-            est.status, int(est.info.get("iterations", 0) or 0), info, spread,
+            est.status, int(est.info.get("iterations", 0) or 0), info, newest(est.spread),
         )  # fmt: skip
 
     def _costs(self, model: Model, part: Record) -> Array:
@@ -334,6 +333,44 @@ class Sliding:
             self.last = Solved(np.array(self.x), np.array(theta, dtype=float), arrays([s])[0], Status[status], 0, {})
 
 
+def newest(spread: Spread | None) -> Spread | None:
+    """Return what is known of the last row alone."""
+    if isinstance(spread, Box):
+        return Box(spread.lo[-1:], spread.hi[-1:], guaranteed=spread.guaranteed)
+    if isinstance(spread, Normal):
+        return Normal.of(spread.mean[-1:], spread.P[-1:], spread._within)
+    if isinstance(spread, Shaped):
+        return Shaped(spread.mean[-1:], spread.P[-1:], spread.skew[-1:], spread.kurt[-1:], spread.within)
+    if isinstance(spread, Both):
+        return Both(spread.mean[-1:], spread.P[-1:], spread.half[-1:])
+    if isinstance(spread, Cloud):
+        return Cloud(spread.points[-1:], spread.weights[-1:])
+    return None
+
+
+def stacked(spreads: list[Spread | None]) -> Spread | None:
+    """Return the spreads of single rows as one, None where they differ in kind."""
+    first = spreads[0]
+    if isinstance(first, Box) and all(isinstance(s, Box) for s in spreads):
+        lo, hi = (np.concatenate([getattr(s, end) for s in spreads]) for end in ("lo", "hi"))
+        return Box(lo, hi, guaranteed=all(s is not None and s.guaranteed for s in spreads))
+    if all(isinstance(s, Normal | Shaped) for s in spreads):
+        bent = [s if isinstance(s, Shaped) else _unbent(s) for s in spreads]
+        columns = [np.concatenate([getattr(s, f) for s in bent]) for f in ("mean", "P", "skew", "kurt")]
+        return Shaped(*columns, bent[-1].within)
+    if isinstance(first, Both) and all(isinstance(s, Both) for s in spreads):
+        return Both(*(np.concatenate([getattr(s, f) for s in spreads]) for f in ("mean", "P", "half")))
+    if isinstance(first, Cloud) and all(isinstance(s, Cloud) for s in spreads):
+        points, weights = (np.concatenate([getattr(s, f) for s in spreads]) for f in ("points", "weights"))
+        return Cloud(points, weights)
+    return None
+
+
+def _unbent(spread: Any) -> Shaped:
+    none = np.zeros(spread.mean.shape)
+    return Shaped(spread.mean, spread.P, none, none, spread._within)
+
+
 class Live:
     """The on-line form of `Window`, for `halfwidth.stream`."""
 
@@ -361,7 +398,7 @@ class Live:
         return Estimate(
             np.array([held.t]),
             held.x[-1][None].copy(),
-            None if solved.spread is None else Box(solved.spread[0][None], solved.spread[1][None]),
+            solved.spread,
             solved.status,
             self.method,
             q=solved.s[:nx].copy() if good else None,

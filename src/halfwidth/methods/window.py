@@ -44,6 +44,7 @@ from halfwidth.methods._sliding import (
     Sliding,
     first_costs,
     rows_since_fix,
+    stacked,
     window_lasts,
     window_starts,
 )
@@ -53,7 +54,7 @@ from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.solvers.banded import POINTS, STATUSES, Chain, chain_of, solve
-from halfwidth.spread import Box
+from halfwidth.spread import Box, Spread
 
 
 @dataclass(frozen=True)
@@ -193,8 +194,7 @@ class Window:
             found.newest_low[t], found.newest_high[t], found.newest_windows[t] = rows.ahead.bounds()
             held = slice(rows.first, t + 2)
             found.smoothed[held], found.low[held], found.high[held] = rows.x, rows.low, rows.high
-            if solved.spread is not None:
-                found.spread_lo[t], found.spread_hi[t] = solved.spread
+            found.spreads.append(solved.spread)
         return found
 
     def _estimate(self, model: Model, record: Record, start: NDArray[np.int32], found: "_Found") -> Estimate:
@@ -232,9 +232,7 @@ class Window:
             info["message"] = f"{worst.value}: {len(unsolved)} of {T} windows, the first at row {unsolved[0]}"
         if np.any(since > 0) and "message" not in info:
             info["message"] = f"{worst.value}; {int(np.count_nonzero(since > 0))} rows extrapolate beyond the last fix"
-        spread = None
-        if np.isfinite(found.spread_lo).all() and not np.isnan(found.spread_lo).any():
-            spread = Box(found.spread_lo, found.spread_hi)
+        spread = stacked(found.spreads) if len(found.spreads) == T else None
         theta = found.theta[-1] if found.theta is not None and found.theta.shape[1] else None
         s = found.s[-1]
         known = np.isfinite(s).all() and found.statuses[-1].good
@@ -269,8 +267,7 @@ class _Found:
     newest_low: Array = dataclasses.field(init=False)
     newest_high: Array = dataclasses.field(init=False)
     newest_windows: NDArray[np.int_] = dataclasses.field(init=False)
-    spread_lo: Array = dataclasses.field(default_factory=lambda: np.full((1, 1), np.nan))
-    spread_hi: Array = dataclasses.field(default_factory=lambda: np.full((1, 1), np.nan))
+    spreads: list[Spread | None] = dataclasses.field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.newest_low, self.newest_high = np.empty_like(self.filtered), np.empty_like(self.filtered)
@@ -287,9 +284,6 @@ class _Found:
             [Status.OK] * T,
             np.zeros(T, dtype=int),
             np.full((T, p), np.nan),
-            None,
-            np.full((T, nx), np.nan),
-            np.full((T, nx), np.nan),
         )
 
 

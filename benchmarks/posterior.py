@@ -1,0 +1,285 @@
+"""Accuracy and coverage of `Posterior` on the system of Pavelková and Kárný (2013), sec. 6.
+
+    python benchmarks/posterior.py [table] [priors] [ensemble] [outliers] [robust] [calibration]
+
+Paths stay inside the boxes by rejection: a disturbance that would leave them is drawn again. The Kalman filter is told the true
+covariances, sees the whole record and is clipped to the boxes; `Posterior` sees windows of `Delta` + 1 rows and is told
+no half-width. Without arguments the table is printed. `WINDOWS=500` sets the number of windows.
+"""
+
+import os
+import sys
+import time
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np  # noqa: E402
+
+import halfwidth as hw  # noqa: E402
+from halfwidth.methods import posterior  # noqa: E402
+from halfwidth.reproduce.paper003 import BOX, KAPPA, A, B, C, E, F, Q, R  # noqa: E402
+
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+WINDOWS = int(os.environ.get("WINDOWS", "500"))
+
+
+def drawn(rng, rows, *, correlated=False, missing=0.0):
+    """Return states (rows + 1, 3), x0 first, and a record; every state inside the box."""
+    G = np.linalg.inv(E) if correlated else np.eye(3)
+    x, X, U = np.zeros(3), [], []
+    for _ in range(rows + 30):
+        for attempt in range(10_000):
+            if attempt % 100 == 0:  # no disturbance keeps this input inside: another input
+                u = rng.uniform(-1, 1, 1)
+            new = G @ (A @ x + B @ u + rng.uniform(-Q, Q, 3))
+            if BOX.contains(new):
+                break
+        x = new
+        X.append(x)
+        U.append(u)
+    X, u = np.array(X)[29:], np.array(U)[30:]
+    y = X[1:] @ C.T + rng.uniform(-R, R, (rows, 2))
+    if correlated:
+        y = y @ np.linalg.inv(F).T
+    y[rng.random(y.shape) < missing] = np.nan
+    return X, hw.Record(np.arange(1.0, rows + 1), y, u)
+
+
+def system(w, e, x0=BOX, *, correlated=False, bounds=BOX):
+    """Return the model of the paper."""
+    return hw.Linear(A, B, C, w, e, x0, E=E if correlated else None, F=F if correlated else None, bounds=bounds)
+
+
+def windows(delta, count, seed, *, correlated=False, missing=0.0):
+    """Return the whole record, its states, and half-overlapping windows (first row, states, record)."""
+    rng = np.random.default_rng(seed)
+    step = (delta + 1) // 2
+    X, record = drawn(rng, step * count + delta + 1, correlated=correlated, missing=missing)
+    found = []
+    for k in range(count):
+        a = k * step
+        b = a + delta + 1
+        found.append((a, X[a : b + 1], hw.Record(record.t[a:b], record.y[a:b], record.u[a:b])))
+    return X, record, found
+
+
+def told_the_truth(record, *, correlated):
+    """Kalman filter with the true covariances, clipped to the boxes."""
+    noise = hw.Gaussian(np.full(3, Q**2 / 3)), hw.Gaussian(np.full(2, R**2 / 3))
+    model = system(*noise, hw.Normal(np.zeros(3), 0.1), correlated=correlated, bounds=None)
+    return np.clip(hw.estimate(model, record, hw.KalmanFilter()).x, BOX.lo, BOX.hi)
+
+
+def one_case(delta, *, correlated=False, missing=0.0, count=WINDOWS, seed=7, method=None):
+    """Return filter and mid-window errors over those of the Kalman filter, coverage and learned half-widths."""
+    X, record, found = windows(delta, count, seed, correlated=correlated, missing=missing)
+    kf = told_the_truth(record, correlated=correlated)
+    unknown = hw.Uniform.unknown(at_most=1.0)
+    model = system(unknown, unknown, correlated=correlated)
+    method = hw.Posterior() if method is None else method
+    error, theirs, inside, s, status, ends = [], [], [], [], [], []
+    seconds = 0.0
+    for a, x, part in found:
+        start = time.process_time()
+        est = hw.estimate(model, part, method)
+        seconds += time.process_time() - start
+        status.append(est.status)
+        mid = (delta + 1) // 2 - 1
+        error.append([np.abs(est.x[k] - x[1:][k]).mean() for k in (-1, mid)])
+        theirs.append([np.abs(kf[a + delta] - x[-1]).mean(), np.abs(kf[a + mid] - x[mid + 1]).mean()])
+        hit = np.array([(x[1:] >= lo) & (x[1:] <= hi) for lo, hi in (est.interval(q) for q in LEVELS)])
+        inside.append(hit.mean(axis=(1, 2)))
+        ends.append(hit[:, -1].mean(axis=1))
+        if est.q is not None:
+            s.append(np.r_[est.q, est.r])
+    error, theirs = np.array(error), np.array(theirs)
+    ratio = error.mean(axis=0) / theirs.mean(axis=0)
+    spread = np.std(np.array(inside), axis=0) / np.sqrt(count / 2)
+    return {
+        "filter": error[:, 0].mean(), "kf": theirs[:, 0].mean(), "ratio": ratio[0],
+        "mid": error[:, 1].mean(), "kf mid": theirs[:, 1].mean(), "mid ratio": ratio[1],
+        "coverage": 100 * np.mean(inside, axis=0), "error of it": 100 * spread, "at the end": 100 * np.mean(ends, axis=0),
+        "s": np.mean(s, axis=0), "bad": sum(not q.good for q in status), "ms": 1e3 * seconds / count,
+    }  # fmt: skip
+
+
+def show(name, c):
+    """Print one row of the table."""
+    cover = " ".join(f"{v:5.1f}" for v in c["coverage"])
+    print(
+        f"{name:<26} {c['filter']:.4f} {c['kf']:.4f} {c['ratio']:5.2f}  {c['mid']:.4f} {c['kf mid']:.4f} {c['mid ratio']:5.2f}"
+        f"  {cover}  (+-{c['error of it'].max():.1f})  {' '.join(f'{v:.3f}' for v in c['s'])}  {c['bad']:3d}  {c['ms']:6.1f}",
+        flush=True,
+    )
+
+
+def table():
+    """Print errors, coverage and learned half-widths."""
+    print(f"{WINDOWS} windows; half-widths unknown (truth .1 .1 .1 .3 .3); mean absolute errors over the three states")
+    print(
+        " " * 26, "filter    KF ratio     mid     KF ratio   covered at 50 80 90 95 %          learned s   bad  CPU ms"
+    )
+    for delta in (5, 25, 50):
+        show(f"Delta {delta}", one_case(delta))
+    show("Delta 25, 20 % missing", one_case(25, missing=0.2))
+    show("Delta 25, E and F", one_case(25, correlated=True))
+    show("Delta 25, E, F, missing", one_case(25, correlated=True, missing=0.2))
+
+
+def priors():
+    """Print coverage and bias for other powers of the prior."""
+    kept = posterior.POWER
+    for power in (0.2, 0.4, 0.6, 0.8, 1.0):
+        posterior.POWER = power
+        for delta in (5, 25, 50):
+            show(f"power {power}, Delta {delta}", one_case(delta, count=min(WINDOWS, 200)))
+    posterior.POWER = kept
+
+
+def ensemble():
+    """Compare widths with the interval of the paper at the coverage that it has."""
+    print("width at mid-window over that of the paper's ensemble interval of equal coverage, Delta 25")
+    rng = np.random.default_rng(3)
+    rows = min(4 * WINDOWS, 2000)
+    X, record = drawn(rng, rows)
+    unknown = hw.Uniform.unknown(at_most=1.0)
+    model = system(unknown, unknown)
+    theirs = hw.estimate(model, record, hw.Window(hw.BatchLP(objective="paper", point="optimal"), 25, fixes=0))
+    inner = slice(40, rows - 40)
+    found = []
+    for a in range(0, rows - 26, 13):
+        est = hw.estimate(
+            model, hw.Record(record.t[a : a + 26], record.y[a : a + 26], record.u[a : a + 26]), hw.Posterior()
+        )
+        found.append((a + 12, est))
+    for kappa in KAPPA:
+        lo, hi = hw.ensemble_interval(theirs, kappa)
+        inside = ((X[1:] >= lo) & (X[1:] <= hi))[inner].mean()
+        width = (hi - lo)[inner].mean()
+        level = _level(found, X, inside)
+        ours = np.mean([np.subtract(*est.interval(level)[::-1])[12] for _, est in found])
+        print(
+            f"  kappa {kappa:g}: covers {inside:.1%}, width {width:.3f}; ours {ours:.3f} at level {level:.3f}: {width / ours:.2f} times narrower"
+        )
+
+
+def _level(found, X, share):
+    """Return the level whose intervals at mid-window cover this share."""
+    lo, hi = 0.02, 0.998
+    for _ in range(20):
+        mid = 0.5 * (lo + hi)
+        inside = np.mean(
+            [(X[k + 1] >= a[12]) & (X[k + 1] <= b[12]) for k, (a, b) in ((k, e.interval(mid)) for k, e in found)]
+        )
+        lo, hi = (mid, hi) if inside < share else (lo, mid)
+    return 0.5 * (lo + hi)
+
+
+def outliers():
+    """Replace 1 % of y by 10 r off, and name them."""
+    unknown = hw.Uniform.unknown(at_most=1.0)
+    model = system(unknown, unknown)
+    errors, hits, misses, false = [], 0, 0, 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        X, record = drawn(rng, 200)
+        y = record.y.copy()
+        bad = rng.random(y.shape) < 0.01
+        y[bad] += rng.choice([-10 * R, 10 * R], bad.sum())
+        clean = hw.estimate(model, record, hw.Posterior())
+        est = hw.estimate(model, hw.Record(record.t, y, record.u), hw.Posterior(outliers=True))
+        errors.append([np.abs(e.x - X[1:]).mean() for e in (clean, est)])
+        named = est.info["outlier_probability"] > 0.5
+        hits, misses, false = hits + (named & bad).sum(), misses + (~named & bad).sum(), false + (named & ~bad).sum()
+    one, two = np.mean(errors, axis=0)
+    print(
+        f"1 % outliers of 10 r, 20 records of 200 rows: error {two:.4f} against {one:.4f} without, ratio {two / one:.3f}"
+    )
+    print(f"  named {hits}, missed {misses}, named wrongly {false}")
+
+
+def robust():
+    """Estimate random windows: missing rows, boxes, outliers, zero noise, infeasible data."""
+    rng = np.random.default_rng(0)
+    count, bad = 20 * WINDOWS, 0
+    status = {}
+    for _ in range(count):
+        n, ny, T = rng.integers(1, 4), rng.integers(1, 3), rng.integers(1, 15)
+        scale = 10 ** rng.uniform(-6, 6)
+        noise = [
+            hw.Uniform.unknown(at_most=rng.choice([1.0, 10.0]) * scale),
+            hw.Uniform(scale * rng.choice([0.0, 1e-6, 0.1, 1.0])),
+            hw.Gaussian((scale * rng.choice([0.0, 1e-3, 1.0])) ** 2),
+            hw.Uniform.unknown() + hw.Gaussian((0.1 * scale) ** 2),
+        ]
+        prior = [hw.Box(-scale * np.ones(n), scale * np.ones(n)), None, hw.Normal(np.zeros(n), scale**2)][
+            rng.integers(3)
+        ]
+        bounds = [None, (-3 * scale * np.ones(n), 3 * scale * np.ones(n))][rng.integers(2)]
+        e = noise[rng.integers(4)]
+        model = hw.Linear(
+            rng.uniform(-1, 1, (n, n)),
+            None,
+            rng.standard_normal((ny, n)),
+            noise[rng.integers(4)],
+            e,
+            prior,
+            bounds=bounds,
+        )
+        y = scale * rng.standard_normal((T, ny))
+        y[rng.random(y.shape) < rng.choice([0.0, 0.3, 1.0])] = np.nan
+        if rng.random() < 0.3:
+            y[rng.integers(T)] *= 1e3
+        named = not isinstance(e, hw.Gaussian) and rng.random() < 0.3
+        est = hw.estimate(model, hw.Record(np.arange(1.0, T + 1), y), hw.Posterior(nodes=8, outliers=bool(named)))
+        numbers = [est.x, *est.interval(0.9), *(v for v in (est.q, est.r, est.loglik) if v is not None)]
+        bad += not all(np.isfinite(v).all() for v in numbers)
+        status[est.status.name] = status.get(est.status.name, 0) + 1
+    print(f"{count} random windows: {bad} with a number that is not finite; statuses {status}")
+
+
+def calibration():
+    """Simulation-based calibration: ranks of the true states and half-widths in their posterior, ten bins."""
+    rng = np.random.default_rng(5)
+    ranks, of_s = [], []
+    from scipy.stats import norm
+
+    levels = np.linspace(0.1, 0.9, 9)
+    for _ in range(WINDOWS):
+        q, r = np.exp(rng.uniform(np.log(0.05), np.log(0.2), 3)), np.exp(rng.uniform(np.log(0.15), np.log(0.6), 2))
+        true = system(hw.Uniform(q), hw.Uniform(r), hw.Box(0.3 * BOX.lo, 0.3 * BOX.hi), bounds=None)
+        truth, record = hw.simulate(true, rng.uniform(-1, 1, (26, 1)), seed=int(rng.integers(2**31)))
+        unknown = hw.Uniform.unknown(at_most=3.0)
+        est = hw.estimate(system(unknown, unknown, true.x0, bounds=None), record, hw.Posterior())
+        below = np.zeros(est.x.shape)
+        for p in levels:
+            side = est.interval(abs(2 * p - 1)) if p != 0.5 else (est.x, est.x)
+            below += truth.x > (side[0] if p < 0.5 else side[1])
+        ranks.append(below)
+        w = est.info["half_widths"]
+        z = (np.log(np.r_[q, r]) - np.log(w["mean"])) / np.maximum(w["sd"] / w["mean"], 1e-9)
+        of_s.append(norm.cdf(z))
+    counts = np.bincount(np.array(ranks, dtype=int).ravel(), minlength=10)
+    print(
+        f"states, {WINDOWS} windows: share of each tenth, %: "
+        + " ".join(f"{100 * c / counts.sum():.1f}" for c in counts)
+    )
+    bins = np.histogram(np.array(of_s).ravel(), bins=10, range=(0, 1))[0]
+    print(
+        "half-widths:                 share of each tenth, %: " + " ".join(f"{100 * b / bins.sum():.1f}" for b in bins)
+    )
+
+
+def main():
+    """Run what is asked for."""
+    known = {
+        "table": table, "priors": priors, "ensemble": ensemble, "outliers": outliers, "robust": robust,
+        "calibration": calibration,
+    }  # fmt: skip
+    for name in sys.argv[1:] or ["table"]:
+        known[name]()
+
+
+if __name__ == "__main__":
+    main()

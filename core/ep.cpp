@@ -1,0 +1,160 @@
+// Entry points of core/ep.hpp.
+#include "ep.hpp"
+#include "ep_learn.hpp"
+
+namespace hw {
+namespace HW_ISA {
+namespace {
+
+std::size_t block_size(const EpArgs& a) {
+    const std::size_t stages = a.T + 1, n = a.n;
+    const std::size_t shape = a.k3 ? stages * (5 * n * n + 2 * n) + 2 * std::size_t(a.rows) : 0;
+    return stages * (2 * n + n * (n + 1)) + stages * 2 * n + 2 * std::size_t(a.rows) + 4 * std::size_t(a.groups) + 4 + shape;
+}
+
+struct Place {
+    V* p;
+    V* take(std::ptrdiff_t size) {
+        V* q = p;
+        p += size;
+        return q;
+    }
+};
+
+// the arrays of a block; `f` gets its slopes
+template <class N>
+void settle_in(Ep<N>& ep, EpFound& f, Place& place) {
+    const EpArgs& a = ep.a;
+    const std::ptrdiff_t n = ep.n, stages = a.T + 1, tri = n * (n + 1) / 2, square = stages * n * n;
+    EpState& s = ep.s;
+    s.mp = place.take(stages * n);
+    s.eb = place.take(stages * n);
+    s.Pp = place.take(stages * tri);
+    s.Lb = place.take(stages * tri);
+    s.m = place.take(stages * n);
+    s.D = place.take(stages * n);
+    s.tau = place.take(a.rows);
+    s.nu = place.take(a.rows);
+    s.s = place.take(a.groups + 1);
+    f.slope = place.take(a.groups + 1);
+    f.learned = place.take(a.groups);
+    if (!a.k3) return;
+    EpCross& c = ep.cross;
+    c.S = place.take(square);
+    c.Pf = place.take(square);
+    c.B = place.take(square);
+    c.X0 = place.take(square);
+    c.X1 = place.take(square);
+    c.w3 = place.take(stages * n);
+    c.w4 = place.take(stages * n);
+    c.r3 = place.take(a.rows);
+    c.r4 = place.take(a.rows);
+}
+
+template <class N>
+int run(N n, const EpArgs& a) {
+    for (int first = 0; first < a.members; first += lanes) {
+        Ep<N> ep{n, a, {first, a.members - 1}, {}, {}};
+        EpFound f{};
+        Place place{reinterpret_cast<V*>(a.work)};
+        settle_in(ep, f, place);
+        const EpCross wanted = ep.cross;
+        ep.cross = EpCross{};
+        EpState& s = ep.s;
+        const std::ptrdiff_t stages = a.T + 1;
+        const auto member = [&](int l) { return first + l < a.members ? first + l : a.members - 1; };
+        for (int l = 0; l < lanes; l++) {
+            for (int g = 0; g < a.groups; g++) s.s[g].set(l, a.s[std::ptrdiff_t(member(l)) * a.groups + g]);
+            s.eps.set(l, a.eps[member(l)]);
+        }
+        if (a.warm) {
+            for (int l = 0; l < lanes; l++) {
+                const std::ptrdiff_t k = member(l);
+                for (std::ptrdiff_t i = 0; i < stages * n; i++) {
+                    s.m[i].set(l, a.m[k * stages * n + i]);
+                    s.D[i].set(l, a.D[k * stages * n + i]);
+                }
+                for (int i = 0; i < a.rows; i++) {
+                    s.tau[i].set(l, a.tau[k * a.rows + i]);
+                    s.nu[i].set(l, a.nu[k * a.rows + i]);
+                }
+            }
+            ep.forget();
+            EpFound none = f;
+            ep.look(none);  // the message of the sites that were given
+        } else {
+            ep.start();
+        }
+        const int used = a.sweeps > 0 ? ep.settle(f, a.sweeps, a.tol, a.damping) : 0;
+        ep.cross = wanted;
+        ep.look(f);
+        if (a.k3) ep.shapes(a.k3, a.k4);
+        for (int l = 0; l < lanes && first + l < a.members; l++) {
+            const std::ptrdiff_t k = first + l;
+            a.log_z[k] = ep.sound(f, l) ? f.log_z[l] : minus_inf;
+            a.residual[k] = f.residual[l];
+            a.worst[k] = f.worst[l];
+            for (int g = 0; g < a.groups; g++) a.learned[k * a.groups + g] = f.learned[g][l];
+            a.used[k] = used;
+            for (int g = 0; g <= a.groups; g++) a.slope[k * (a.groups + 1) + g] = f.slope[g][l];
+            for (std::ptrdiff_t i = 0; i < stages * n; i++) {
+                a.m[k * stages * n + i] = s.m[i][l];
+                a.D[k * stages * n + i] = s.D[i][l];
+            }
+            for (int i = 0; i < a.rows; i++) {
+                a.tau[k * a.rows + i] = s.tau[i][l];
+                a.nu[k * a.rows + i] = s.nu[i][l];
+            }
+        }
+    }
+    return 0;
+}
+
+template <class N>
+int learn(N n, const EpLearnArgs& a) {
+    Ep<N> ep{n, a.base, {0, lanes - 1}, {}, {}};
+    EpLearner<N> learner{ep, a, {}, nullptr, nullptr, nullptr, nullptr, nullptr, 0, {}, {}, {}, 0, false};
+    Place place{reinterpret_cast<V*>(a.base.work)};
+    settle_in(ep, learner.f, place);
+    const std::ptrdiff_t size = std::ptrdiff_t(a.base.T + 1) * n;
+    learner.keep_m = place.take(size);
+    learner.keep_D = place.take(size);
+    learner.keep_tau = place.take(a.base.rows);
+    learner.keep_nu = place.take(a.base.rows);
+    learner.was = place.take(a.base.groups + 1);
+    return learner.run();
+}
+
+}  // namespace
+
+std::size_t ep_workspace(const EpArgs& a) { return block_size(a) * lanes; }
+
+int ep_run(const EpArgs& a) {
+    const FlushTiny flush;
+    switch (a.n) {
+        case 1: return run(Dim<1>(), a);
+        case 2: return run(Dim<2>(), a);
+        case 3: return run(Dim<3>(), a);
+        case 4: return run(Dim<4>(), a);
+        default: return run(Dim<0>(a.n), a);
+    }
+}
+
+std::size_t ep_learn_workspace(const EpLearnArgs& a) {
+    const std::size_t more = 2 * std::size_t(a.base.T + 1) * a.base.n + 2 * std::size_t(a.base.rows) + a.base.groups + 1;
+    return ep_workspace(a.base) + more * lanes;
+}
+
+int ep_learn(const EpLearnArgs& a) {
+    const FlushTiny flush;
+    switch (a.base.n) {
+        case 1: return learn(Dim<1>(), a);
+        case 2: return learn(Dim<2>(), a);
+        case 3: return learn(Dim<3>(), a);
+        case 4: return learn(Dim<4>(), a);
+        default: return learn(Dim<0>(a.base.n), a);
+    }
+}
+
+}  // namespace HW_ISA
+}  // namespace hw

@@ -1,0 +1,823 @@
+// Expectation propagation on a chain: Gaussian beliefs about x_0 .. x_T where every factor acts on one linear functional.
+//
+//     x_t = A x_{t-1} + b_t + G (w_t + g_t),  g_t ~ N(0, Q)          G = E^-1, A and b already multiplied by it
+//     h_k' x_t - b_k = e_k                                           rows: outputs, bounds, half-spaces
+//
+// Each w_ti has a factor f (uniform) that is replaced by a Gaussian site N(w; m, D), each row one that is replaced by
+// exp(nu z - tau z^2 / 2) of its residual z. A site is renewed by taking it out of the belief (the cavity N(mu, c)),
+// asking the noise for the moments of f(z) N(z; mu, c) (core/noise.hpp), and choosing the site that reproduces them.
+// Gaussian factors are their own sites, so without others one sweep is a Kalman filter and a Rauch-Tung-Striebel smoother.
+//
+// A sweep goes forwards and backwards and renews every site once, each with what its neighbours have just become:
+//
+//   forwards   predicted moments (m_p, P_p), joined with the future's message exp(eta_b' x - x' Lambda_b x / 2):
+//              P_s = (P_p^-1 + Lambda)^-1; the rows of t are renewed one after the other, P_s follows by rank one
+//   backwards  the future and the rows of t as Lambda, eta; N = (Lambda^-1 + P_p)^-1, r = (I + Lambda P_p)^-1 (eta - Lambda m_p),
+//              so that w_t has posterior mean m + D r and covariance D - D N D (with G: G' r, G' N G), and its cavity is
+//              c = 1/N_ii - D_i, mu = m_i + r_i / N_ii; N and r follow each renewed site by rank one. Then
+//              Lambda_b <- A' (Lambda^-1 + Q + G D G')^-1 A one step back.
+//
+// Moments forwards and information backwards: noise of variance 0 and outputs that say nothing are no special cases.
+// Evidence: log Z = sum over sites of (log Z_k - log of the site's integral under its cavity) + the Gaussian's own; at a
+// fixed point its derivative in a parameter of f_k is that of log Z_k alone.
+//
+// Four members (same rows, other half-widths or matrices) run side by side, one a lane.
+#pragma once
+
+#include "chain.hpp"
+#include "ep_entry.hpp"
+#include "lane.hpp"
+#include "noise.hpp"
+
+namespace hw {
+namespace HW_ISA {
+
+typedef Lanes<4> V;
+
+inline V of(V4 a) { return V::of(a); }
+inline V smaller(const V& a, const V& b) { return V::of(a.v < b.v ? a.v : b.v); }
+
+// sizes of local arrays
+template <class N>
+constexpr int ep_cap = N::fixed ? N::cap : ep_states;
+
+// L (n,n) = lower Cholesky factor of a positive semidefinite M (n,n); directions below rounding are left out
+template <class N>
+inline void ep_root(N n, const V* M, V* L) {
+    for (int j = 0; j < n; j++) {
+        V p = M[j * n + j];
+        for (int k = 0; k < j; k++) p -= L[j * n + k] * L[j * n + k];
+        const V floor = V(1e-14) * M[j * n + j] + V(1e-300);
+        const auto fine = p.v > floor.v;
+        const V root = of(fine ? sqrt4(p.v) : V4{}), inverse = of(fine ? 1.0 / root.v : V4{});
+        for (int i = 0; i < j; i++) L[i * n + j] = V(0.0);
+        L[j * n + j] = root;
+        for (int i = j + 1; i < n; i++) {
+            V s = M[i * n + j];
+            for (int k = 0; k < j; k++) s -= L[i * n + k] * L[j * n + k];
+            L[i * n + j] = s * inverse;
+        }
+    }
+}
+
+// out (n,n) = ((L L')^-1 + M)^-1 = L (I + L' M L)^-1 L' for a lower L and a symmetric M >= 0; the determinant of
+// I + L' M L is multiplied into `det` if it is given
+template <class N>
+inline void ep_join(N n, const V* L, const V* M, V* out, V* det = nullptr) {
+    constexpr int c = ep_cap<N>;
+    V S[c * c], Y[c * c], work[c];
+    for (int i = 0; i < n; i++)  // Y = M L
+        for (int j = 0; j < n; j++) {
+            V s(0.0);
+            for (int k = j; k < n; k++) s += M[i * n + k] * L[k * n + j];
+            Y[i * n + j] = s;
+        }
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j <= i; j++) {
+            V s(i == j ? 1.0 : 0.0);
+            for (int k = i; k < n; k++) s += L[k * n + i] * Y[k * n + j];
+            S[i * n + j] = s;
+        }
+    unit_factor(n, S, 0.0, work);
+    if (det)
+        for (int i = 0; i < n; i++) *det = *det / S[i * n + i];
+    for (int j = 0; j < n; j++) {  // row j of L is column j of L'
+        V* y = Y + j * n;
+        for (int i = 0; i < n; i++) y[i] = L[j * n + i];
+        unit_lower(n, S, y);
+    }
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j <= i; j++) {
+            V s(0.0);
+            for (int k = 0; k < n; k++) s += Y[i * n + k] * S[k * n + k] * Y[j * n + k];
+            out[i * n + j] = out[j * n + i] = s;
+        }
+}
+
+// A stack of matrices for one block of members, brought into lanes.
+struct EpBlock {
+    int first, last;  // members first .. first + 3, held at `last`
+    inline V load(const EpStack& s, std::ptrdiff_t at) const {
+        if (s.member == 0) return V(s.data[at]);
+        V v;
+        for (int l = 0; l < lanes; l++) {
+            const int k = first + l < last ? first + l : last;
+            v.set(l, s.data[k * s.member + at]);
+        }
+        return v;
+    }
+    inline void loads(const EpStack& s, int t, int size, V* out) const {
+        const std::ptrdiff_t k = s.index ? s.index[t] : s.count == 1 ? 0 : t;
+        for (int i = 0; i < size; i++) out[i] = load(s, k * size + i);
+    }
+};
+
+// What a block of members holds between sweeps; symmetric matrices as packed lower triangles. Workspace of the caller.
+struct EpState {
+    V *mp, *Pp;    // (T+1, n), (T+1, n(n+1)/2): predicted
+    V *eb, *Lb;    // (T+1, n), (T+1, n(n+1)/2): the future's message
+    V *m, *D;      // (T+1, n): sites of w; those of x_0 in row 0
+    V *tau, *nu;   // (rows,): sites of rows, of the residual
+    V *s;          // (groups,)
+    V eps;         // rate of outliers or losses
+};
+
+// What a sweep finds.
+struct EpFound {
+    V residual;   // largest distance of a site's moments from the belief's, in standard deviations
+    V log_z;      // evidence
+    V* slope;     // (groups + 1,): d log Z / d log s, d log Z / d logit eps
+    V* learned;   // (groups,): sum over the rows of a half-width of (1 - posterior / prior variance)^2
+    V worst;      // smallest log of the share of a cavity that lies in its factor's box
+    V far;        // largest squared distance of a site's mean from its cavity's, in the cavity's variances
+};
+
+// What the shapes of the beliefs need, filled by `look`; null pointers: not wanted.
+struct EpCross {
+    V *S, *Pf;  // (T+1, n, n): covariance of x_t given all, and given what lies up to t
+    V *B;       // (T+1, n, n): covariance of x_{t-1} with x_t
+    V *X0, *X1; // (T+1, n, n): covariance of x_{t-1} and of x_t with w_t
+    V *w3, *w4; // (T+1, n): cumulants of the sites of w over the variance's powers 3 and 4
+    V *r3, *r4; // (rows,): of the rows
+};
+
+template <class N>
+struct Ep {
+    static constexpr int cap = ep_cap<N>;
+    N n;
+    const EpArgs& a;
+    EpBlock block;
+    EpState s;
+    EpCross cross;
+
+    inline int packed() const { return n * (n + 1) / 2; }
+    inline void unpack(const V* p, V* M) const {
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j <= i; j++) M[i * n + j] = M[j * n + i] = p[tri(i, j)];
+    }
+    inline void pack(const V* M, V* p) const {
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j <= i; j++) p[tri(i, j)] = M[i * n + j];
+    }
+    inline int kind(int k) const { return a.kind[k]; }
+
+    // half-width of w_i at stage t (stage 0: of the box of x_0), 0: no site
+    inline bool has_site(int t, int i) const { return t == 0 ? a.half0[i] > 0.0 : a.group_w[i] >= 0; }
+    inline V width(int t, int i) const { return t == 0 ? V(a.half0[i]) : s.s[a.group_w[i]]; }
+
+    // variance of a row's Gaussian part: its own, and what unseen correlated outputs add
+    inline V variance(int k) const {
+        V R(a.R[k]);
+        if (a.mix)
+            for (int g = 0; g < a.groups; g++)
+                if (a.mix[static_cast<std::ptrdiff_t>(k) * a.groups + g] != 0.0)
+                    R += V(a.mix[static_cast<std::ptrdiff_t>(k) * a.groups + g]) * s.s[g] * s.s[g];
+        return R;
+    }
+
+    inline Tilted4 tilted(int k, const V& mu, const V& c) const {
+        switch (kind(k)) {
+            case ep_truncation: {
+                const Truncated4 t = truncated4(mu.v, c.v, all4(a.lo[k]), all4(a.hi[k]));
+                Tilted4 r{};
+                r.log_z = t.log_z;
+                r.mean = t.mean;
+                r.var = t.var;
+                return r;
+            }
+            case noise_uniform: return uniform4(mu.v, c.v, s.s[a.group[k]].v);
+            case noise_uniform_gaussian: return uniform_gaussian4(mu.v, c.v, s.s[a.group[k]].v, variance(k).v);
+            case noise_contaminated:
+                return contaminated4(mu.v, c.v, s.s[a.group[k]].v, variance(k).v, s.eps.v, all4(a.wide));
+            default:
+                return maybe_lost4(mu.v, c.v, a.group[k] >= 0 ? s.s[a.group[k]].v : V4{}, variance(k).v, s.eps.v,
+                                   all4(a.lost[k]));
+        }
+    }
+
+    // ---- start: every uniform as the Gaussian of its variance ----------------------------------------------------
+
+    void start() {
+        for (int t = 0; t <= a.T; t++)
+            for (int i = 0; i < n; i++) {
+                const V w = has_site(t, i) ? width(t, i) : V(0.0);
+                s.m[t * n + i] = V(0.0);
+                s.D[t * n + i] = w * w * V(1.0 / 3.0);
+            }
+        for (int k = 0; k < a.rows; k++) {
+            s.nu[k] = V(0.0);
+            if (kind(k) == noise_gaussian) {
+                s.tau[k] = V(1.0 / a.R[k]);
+            } else if (kind(k) == ep_truncation) {
+                s.tau[k] = V(0.0);
+            } else {
+                const V w = a.group[k] >= 0 ? s.s[a.group[k]] : V(0.0);
+                s.tau[k] = V(1.0) / (w * w * V(1.0 / 3.0) + variance(k));
+            }
+        }
+        forget();
+    }
+
+    // no message from the future
+    void forget() {
+        for (int k = 0; k < (a.T + 1) * n; k++) s.eb[k] = V(0.0);
+        for (int k = 0; k < (a.T + 1) * packed(); k++) s.Lb[k] = V(0.0);
+    }
+
+    // sites follow half-widths that change from `was` to s.s
+    void rescale(const V* was) {
+        for (int t = 1; t <= a.T; t++)
+            for (int i = 0; i < n; i++)
+                if (a.group_w[i] >= 0) {
+                    const V f = s.s[a.group_w[i]] / larger(was[a.group_w[i]], V(1e-300));
+                    s.D[t * n + i] *= f * f;
+                    s.m[t * n + i] *= f;
+                }
+        for (int k = 0; k < a.rows; k++)
+            if (kind(k) != noise_gaussian && kind(k) != ep_truncation && a.group[k] >= 0) {
+                const V f = was[a.group[k]] / larger(s.s[a.group[k]], V(1e-300));
+                s.tau[k] *= f * f;
+                s.nu[k] *= f;
+            }
+    }
+
+    // ---- a stage -------------------------------------------------------------------------------------------------
+
+    // predicted moments of x_0
+    inline void prior(V* mp, V* Pp) const {
+        for (int i = 0; i < n; i++) {
+            mp[i] = V(a.m0[i]) + s.m[i];
+            for (int j = 0; j < n; j++) Pp[i * n + j] = V(a.P0[i * n + j]);
+            Pp[i * n + i] += s.D[i];
+        }
+    }
+
+    // Q + G D G' of stage t >= 1 and the mean b + G m of what is added
+    inline void noise(int t, const V* G, V* Q, V* d) const {
+        const V *D = s.D + t * n, *m = s.m + t * n;
+        if (a.Q.data) block.loads(a.Q, t - 1, n * n, Q);
+        else
+            for (int i = 0; i < n * n; i++) Q[i] = V(0.0);
+        for (int i = 0; i < n; i++) d[i] = block.load(a.b, static_cast<std::ptrdiff_t>(t - 1) * n + i);
+        if (a.G.data) {
+            for (int i = 0; i < n; i++)
+                for (int k = 0; k < n; k++) {
+                    const V g = G[i * n + k] * D[k];
+                    d[i] += G[i * n + k] * m[k];
+                    for (int j = 0; j < n; j++) Q[i * n + j] += g * G[j * n + k];
+                }
+        } else {
+            for (int i = 0; i < n; i++) {
+                Q[i * n + i] += D[i];
+                d[i] += m[i];
+            }
+        }
+    }
+
+    // Lambda, eta: the future's message and the rows of t
+    inline void ahead(int t, V* Lambda, V* eta) const {
+        unpack(s.Lb + t * packed(), Lambda);
+        for (int i = 0; i < n; i++) eta[i] = s.eb[t * n + i];
+        for (int k = a.start[t]; k < a.start[t + 1]; k++) {
+            V h[cap];
+            row(k, h);
+            const V lift = s.nu[k] + s.tau[k] * target(k);
+            for (int i = 0; i < n; i++) {
+                const V th = s.tau[k] * h[i];
+                eta[i] += lift * h[i];
+                for (int j = 0; j < n; j++) Lambda[i * n + j] += th * h[j];
+            }
+        }
+    }
+    inline void row(int k, V* h) const {
+        for (int i = 0; i < n; i++) h[i] = block.load(a.h, static_cast<std::ptrdiff_t>(k) * n + i);
+    }
+    inline V target(int k) const { return block.load(a.y, k); }
+
+    // log of the integral of exp(nu z - tau z^2 / 2) under N(mu, v)
+    static inline V integral(const V& tau, const V& nu, const V& mu, const V& v) {
+        const V f = V(1.0) + tau * v;
+        return V(0.5) * ((nu * nu * v + V(2.0) * nu * mu - tau * mu * mu) / f - of(log4(f.v)));
+    }
+
+    static inline void note(EpFound& f, const V& mean, const V& var, const Tilted4& t, const V& mu, const V& c) {
+        // a site never widens a belief: a factor that would is asked for its mean only
+        const V tv = larger(smaller(of(t.var), c), V(1e-300)), off = of(t.mean) - mu;
+        f.far = larger(f.far, off * off / larger(c, V(1e-300)));
+        const V d = of(t.mean) - mean, e = magnitude(tv - var) / tv;
+        f.residual = larger(f.residual, larger(of(sqrt4((d * d / tv).v)), e));
+    }
+
+    // renew (or, for the evidence, look at) the rows of stage t, given the belief ms, Ps about x_t
+    template <bool renew>
+    inline void rows(int t, V* ms, V* Ps, EpFound& f, double damping) {
+        for (int k = a.start[t]; k < a.start[t + 1]; k++) {
+            const bool fixed = kind(k) == noise_gaussian;
+            if (fixed) {
+                if constexpr (!renew) {
+                    f.log_z -= V(0.5) * V(log_2pi + std::log(a.R[k]));
+                    if (cross.S) cross.r3[k] = cross.r4[k] = V(0.0);
+                }
+                continue;
+            }
+            V h[cap], Ph[cap];
+            row(k, h);
+            V z = -target(k), v(0.0);
+            for (int i = 0; i < n; i++) {
+                V q(0.0);
+                for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
+                Ph[i] = q;
+                v += h[i] * q;
+                z += h[i] * ms[i];
+            }
+            v = larger(v, V(0.0));
+            // the cavity; a site that claims more than the belief has is a bad one and is taken as nothing
+            const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9));
+            const V c = v / open, mu = (z - v * s.nu[k]) / open;
+            const Tilted4 q = tilted(k, mu, c);
+            note(f, z, v, q, mu, c);
+            if constexpr (renew) {
+                const V tv = larger(of(q.var), V(1e-300));
+                V tau = V(1.0) / tv - V(1.0) / larger(c, V(1e-300));
+                V nu = of(q.mean) / tv - mu / larger(c, V(1e-300));
+                const V d = of(q.mean) - mu;
+                const auto wide = tau.v <= V4{};  // the factor widens the belief: keep its mean only
+                nu = of(wide ? (d / larger(c, V(1e-300))).v : nu.v);
+                tau = of(wide ? V4{} : tau.v);
+                const double step = kind(k) >= noise_contaminated && kind(k) != ep_truncation ? damping : 1.0;
+                const V dt = V(step) * (tau - s.tau[k]), dn = V(step) * (nu - s.nu[k]);
+                const V gain = V(1.0) / larger(V(1.0) + dt * v, V(1e-12));
+                s.tau[k] += dt;
+                s.nu[k] += dn;
+                const V shift = (dn - dt * z) * gain, shrink = dt * gain;
+                for (int i = 0; i < n; i++) {
+                    ms[i] += Ph[i] * shift;
+                    const V g = Ph[i] * shrink;
+                    for (int j = 0; j < n; j++) Ps[i * n + j] -= g * Ph[j];
+                }
+            } else {
+                f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], mu, c);
+                f.worst = smaller(f.worst, of(q.log_z) + unit(k));
+                slopes(k, q, v, f);
+                if (cross.S) ratios(shape(k, mu, c), v, cross.r3 + k, cross.r4 + k);
+                if (a.out) {
+                    for (int l = 0; l < lanes && block.first + l <= block.last; l++)
+                        a.out[static_cast<std::ptrdiff_t>(block.first + l) * a.rows + k] = q.out[l];
+                }
+            }
+        }
+    }
+
+    // log of the width of a row's box: with it the log of a density becomes that of a share
+    inline V unit(int k) const {
+        return kind(k) != ep_truncation && a.group[k] >= 0 ? of(log4(2.0 * s.s[a.group[k]].v + 1e-300)) : V(0.0);
+    }
+
+    inline void slopes(int k, const Tilted4& q, const V& v, EpFound& f) const {
+        if (kind(k) == ep_truncation) return;
+        if (a.group[k] >= 0) {
+            f.slope[a.group[k]] += of(q.slope_s);
+            const V own = s.s[a.group[k]] * s.s[a.group[k]] * V(1.0 / 3.0), all = larger(own + variance(k), V(1e-300));
+            const V share = larger(V(1.0) - v / all, V(0.0)) * own / all;
+            f.learned[a.group[k]] += share * share;
+        }
+        if (a.mix) {
+            const V R = larger(variance(k), V(1e-300));
+            for (int g = 0; g < a.groups; g++) {
+                const double w = a.mix[static_cast<std::ptrdiff_t>(k) * a.groups + g];
+                if (w != 0.0) f.slope[g] += of(q.slope_R) * V(2.0 * w) * s.s[g] * s.s[g] / R;
+            }
+        }
+        f.slope[a.groups] += of(q.slope_eps);
+    }
+
+    // ---- the two halves of a sweep -------------------------------------------------------------------------------
+
+    template <bool renew>
+    void forward(EpFound& f, double damping) {
+        V A[cap * cap], G[cap * cap], mf[cap], Pf[cap * cap];
+        if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
+        if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
+        for (int t = 0; t <= a.T; t++) {
+            V mp[cap], Pp[cap * cap];
+            if (t == 0) {
+                prior(mp, Pp);
+            } else {
+                V AP[cap * cap];
+                if (a.A.count != 1) block.loads(a.A, t - 1, n * n, A);
+                if (a.G.data && a.G.count != 1) block.loads(a.G, t - 1, n * n, G);
+                noise(t, G, Pp, mp);
+                for (int i = 0; i < n; i++)
+                    for (int j = 0; j < n; j++) {
+                        V q(0.0);
+                        for (int k = 0; k < n; k++) q += A[i * n + k] * Pf[k * n + j];
+                        AP[i * n + j] = q;
+                        mp[i] += A[i * n + j] * mf[j];
+                    }
+                for (int i = 0; i < n; i++)
+                    for (int j = 0; j <= i; j++) {
+                        V q = Pp[i * n + j];
+                        for (int k = 0; k < n; k++) q += AP[i * n + k] * A[j * n + k];
+                        Pp[i * n + j] = Pp[j * n + i] = q;
+                    }
+            }
+            for (int i = 0; i < n; i++) s.mp[t * n + i] = mp[i];
+            pack(Pp, s.Pp + t * packed());
+            if (a.start[t] < a.start[t + 1] || !renew) {
+                V Lambda[cap * cap], eta[cap], L[cap * cap], ms[cap], Ps[cap * cap];
+                ahead(t, Lambda, eta);
+                ep_root(n, Pp, L);
+                ep_join(n, L, Lambda, Ps);
+                for (int i = 0; i < n; i++)
+                    for (int j = 0; j < n; j++) eta[i] -= Lambda[i * n + j] * mp[j];
+                for (int i = 0; i < n; i++) {
+                    ms[i] = mp[i];
+                    for (int j = 0; j < n; j++) ms[i] += Ps[i * n + j] * eta[j];
+                }
+                if (!renew && cross.S) {
+                    give(t, ms, Ps);
+                    for (int i = 0; i < n * n; i++) cross.S[t * n * n + i] = Ps[i];
+                }
+                rows<renew>(t, ms, Ps, f, damping);
+            }
+            // filtered: the rows of t folded in one after the other
+            for (int i = 0; i < n; i++) mf[i] = mp[i];
+            for (int i = 0; i < n * n; i++) Pf[i] = Pp[i];
+            for (int k = a.start[t]; k < a.start[t + 1]; k++) {
+                V h[cap], Ph[cap];
+                row(k, h);
+                V z = -target(k), v(0.0);
+                for (int i = 0; i < n; i++) {
+                    V q(0.0);
+                    for (int j = 0; j < n; j++) q += Pf[i * n + j] * h[j];
+                    Ph[i] = q;
+                    v += h[i] * q;
+                    z += h[i] * mf[i];
+                }
+                const V tau = s.tau[k], gain = V(1.0) / (V(1.0) + tau * v);
+                if constexpr (!renew) f.log_z += integral(tau, s.nu[k], z, v);
+                const V shift = (s.nu[k] - tau * z) * gain, shrink = tau * gain;
+                for (int i = 0; i < n; i++) {
+                    mf[i] += Ph[i] * shift;
+                    const V g = Ph[i] * shrink;
+                    for (int j = 0; j < n; j++) Pf[i * n + j] -= g * Ph[j];
+                }
+            }
+            if (!renew && cross.S)
+                for (int i = 0; i < n * n; i++) cross.Pf[t * n * n + i] = Pf[i];
+        }
+    }
+
+    template <bool renew>
+    void backward(EpFound& f) {
+        V A[cap * cap], G[cap * cap];
+        if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
+        if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
+        for (int t = a.T; t >= 0; t--) {
+            V Lambda[cap * cap], eta[cap], Pp[cap * cap], U[cap * cap], W[cap * cap], r[cap], gap[cap];
+            if (t > 0) {
+                if (a.A.count != 1) block.loads(a.A, t - 1, n * n, A);
+                if (a.G.data && a.G.count != 1) block.loads(a.G, t - 1, n * n, G);
+            }
+            ahead(t, Lambda, eta);
+            unpack(s.Pp + t * packed(), Pp);
+            ep_root(n, Lambda, U);
+            ep_join(n, U, Pp, W);
+            for (int i = 0; i < n; i++) {
+                gap[i] = eta[i];
+                for (int j = 0; j < n; j++) gap[i] -= Lambda[i * n + j] * s.mp[t * n + j];
+            }
+            less(W, Pp, gap, r);
+            if (!renew && cross.S) covariances(t, A, G, W, Pp);
+            if (t > 0 && a.G.data) turn(G, W, r);
+            sites<renew>(t, W, r, f);
+            if (t == 0) break;
+            V Q[cap * cap], d[cap];
+            noise(t, G, Q, d);
+            ep_join(n, U, Q, W);
+            for (int i = 0; i < n; i++)
+                for (int j = 0; j < n; j++) eta[i] -= Lambda[i * n + j] * d[j];
+            less(W, Q, eta, r);
+            V WA[cap * cap];
+            for (int i = 0; i < n; i++)
+                for (int j = 0; j < n; j++) {
+                    V q(0.0);
+                    for (int k = 0; k < n; k++) q += W[i * n + k] * A[k * n + j];
+                    WA[i * n + j] = q;
+                }
+            V *eb = s.eb + (t - 1) * n, *Lb = s.Lb + (t - 1) * packed();
+            for (int i = 0; i < n; i++) {
+                V q(0.0);
+                for (int k = 0; k < n; k++) q += A[k * n + i] * r[k];
+                eb[i] = q;
+                for (int j = 0; j <= i; j++) {
+                    V p(0.0);
+                    for (int k = 0; k < n; k++) p += A[k * n + i] * WA[k * n + j];
+                    Lb[tri(i, j)] = p;
+                }
+            }
+        }
+    }
+
+    // covariances of x_{t-1}, x_t and w_t, given W before it is turned by G
+    inline void covariances(int t, const V* A, const V* G, const V* W, const V* Pp) const {
+        V *B = cross.B + t * n * n, *X0 = cross.X0 + t * n * n, *X1 = cross.X1 + t * n * n;
+        const V* D = s.D + t * n;
+        V WG[cap * cap], left[cap * cap], PA[cap * cap];
+        for (int i = 0; i < n; i++)  // W G D and (I - P W) G D
+            for (int j = 0; j < n; j++) {
+                V q = W[i * n + j];
+                if (t > 0 && a.G.data) {
+                    q = V(0.0);
+                    for (int k = 0; k < n; k++) q += W[i * n + k] * G[k * n + j];
+                }
+                WG[i * n + j] = q * D[j];
+            }
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q = t > 0 && a.G.data ? G[i * n + j] * D[j] : i == j ? D[j] : V(0.0);
+                V p(i == j ? 1.0 : 0.0);
+                for (int k = 0; k < n; k++) {
+                    q -= Pp[i * n + k] * WG[k * n + j];
+                    p -= W[i * n + k] * Pp[k * n + j];
+                }
+                X1[i * n + j] = q;
+                left[i * n + j] = p;  // I - W P
+            }
+        if (t == 0) return;
+        const V* Pf = cross.Pf + (t - 1) * n * n;
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0);
+                for (int k = 0; k < n; k++) q += Pf[i * n + k] * A[j * n + k];
+                PA[i * n + j] = q;
+            }
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0), p(0.0);
+                for (int k = 0; k < n; k++) {
+                    q -= PA[i * n + k] * WG[k * n + j];
+                    p += PA[i * n + k] * left[k * n + j];
+                }
+                X0[i * n + j] = q;
+                B[i * n + j] = p;
+            }
+    }
+
+    // Third and fourth cumulants of the states, to first order in what the sites leave out: a factor whose tilted
+    // distribution has the cumulant k_r adds (Cov(x, z) / Var(z))^r k_r. Factors more than `reach` rows away count as
+    // Gaussian: they add with the r-th power of a small correlation.
+    void shapes(double* k3, double* k4) const {
+        constexpr int reach = 4;
+        for (int t = 0; t <= a.T; t++) {
+            V c3[cap], c4[cap], R[cap * cap], M[cap * cap];
+            for (int i = 0; i < n; i++) c3[i] = c4[i] = V(0.0);
+            const V* S = cross.S + t * n * n;
+            rows_shape(t, S, c3, c4);
+            noise_shape(t, cross.X1 + t * n * n, c3, c4);
+            for (int side = 0; side < 2; side++) {
+                for (int i = 0; i < n * n; i++) {
+                    R[i] = S[i];
+                    M[i] = V(i % (n + 1) == 0 ? 1.0 : 0.0);
+                }
+                for (int l = 1; l <= reach; l++) {
+                    const int u = side == 0 ? t + l : t - l;
+                    if (u < 0 || u > a.T) break;
+                    if (l > 1) gain(R, side == 0 ? u - 1 : u + 1, M);  // Cov(x_t, x_v) Cov(x_v)^-1, v next to u
+                    if (side == 0) {
+                        V C[cap * cap];
+                        product(M, cross.X0 + u * n * n, C);
+                        noise_shape(u, C, c3, c4);
+                        product(M, cross.B + u * n * n, R);
+                    } else {
+                        product_t(M, cross.B + (u + 1) * n * n, R);
+                        V K[cap * cap], C[cap * cap];
+                        gain(R, u, K);
+                        product(K, cross.X1 + u * n * n, C);
+                        noise_shape(u, C, c3, c4);
+                    }
+                    rows_shape(u, R, c3, c4);
+                }
+            }
+            for (int l = 0; l < lanes && block.first + l <= block.last; l++) {
+                const std::ptrdiff_t at = (static_cast<std::ptrdiff_t>(block.first + l) * (a.T + 1) + t) * n;
+                for (int i = 0; i < n; i++) {
+                    const double v = max2(S[i * n + i][l], 1e-300), sd = std::sqrt(v);
+                    k3[at + i] = c3[i][l] / (v * sd);
+                    k4[at + i] = c4[i][l] / (v * v);
+                }
+            }
+        }
+    }
+
+    // covariance R (n,n) of x_t with x_u: what the rows and the noise of u add
+    inline void rows_shape(int u, const V* R, V* c3, V* c4) const {
+        for (int k = a.start[u]; k < a.start[u + 1]; k++) {
+            if (kind(k) == noise_gaussian) continue;
+            V h[cap];
+            row(k, h);
+            for (int i = 0; i < n; i++) {
+                V q(0.0);
+                for (int j = 0; j < n; j++) q += R[i * n + j] * h[j];
+                c3[i] += q * q * q * cross.r3[k];
+                c4[i] += q * q * q * q * cross.r4[k];
+            }
+        }
+    }
+    inline void noise_shape(int u, const V* C, V* c3, V* c4) const {
+        for (int j = 0; j < n; j++)
+            for (int i = 0; i < n; i++) {
+                const V q = C[i * n + j];
+                c3[i] += q * q * q * cross.w3[u * n + j];
+                c4[i] += q * q * q * q * cross.w4[u * n + j];
+            }
+    }
+    inline void product(const V* M, const V* B, V* out) const {
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0);
+                for (int k = 0; k < n; k++) q += M[i * n + k] * B[k * n + j];
+                out[i * n + j] = q;
+            }
+    }
+    inline void product_t(const V* M, const V* B, V* out) const {
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0);
+                for (int k = 0; k < n; k++) q += M[i * n + k] * B[j * n + k];
+                out[i * n + j] = q;
+            }
+    }
+    // M = R S_v^-1
+    inline void gain(const V* R, int v, V* M) const {
+        V L[cap * cap], work[cap];
+        for (int i = 0; i < n * n; i++) {
+            L[i] = cross.S[v * n * n + i];
+            M[i] = R[i];
+        }
+        unit_factor(n, L, 1e-12, work);
+        for (int i = 0; i < n; i++) {
+            V* b = M + i * n;
+            unit_lower(n, L, b);
+            for (int j = 0; j < n; j++) b[j] = b[j] * L[j * n + j];
+            unit_upper(n, L, b);
+        }
+    }
+
+    inline Shape4 shape(int k, const V& mu, const V& c) const {
+        const V4 half = a.group[k] >= 0 ? s.s[a.group[k]].v : V4{};
+        if (kind(k) == ep_truncation) return truncated_shape4(mu.v, c.v, all4(a.lo[k]), all4(a.hi[k]));
+        if (kind(k) == noise_uniform) return truncated_shape4(mu.v, c.v, -half, half);
+        const V4 R = variance(k).v;
+        const Shape4 f = uniform_gaussian_shape4(mu.v, c.v, half, R);
+        if (kind(k) == noise_uniform_gaussian) return f;
+        const V4 p = tilted(k, mu, c).out;
+        if (kind(k) == noise_contaminated)
+            return mixture_shape4(f, gaussian_shape4(mu.v, c.v, R + a.wide * a.wide * half * half), p);
+        Shape4 g{};
+        g.mean = mu.v;
+        g.m2 = c.v;
+        g.m4 = 3.0 * c.v * c.v;
+        return mixture_shape4(f, g, p);
+    }
+    static inline void ratios(const Shape4& q, const V& v, V* out3, V* out4) {
+        const V w = V(1.0) / larger(v, V(1e-60));
+        *out3 = of(q.k3()) * w * w * w;
+        *out4 = of(q.k4()) * w * w * w * w;
+    }
+
+    // r = (I - W P) g = (I + Lambda P)^-1 g
+    inline void less(const V* W, const V* P, const V* g, V* r) const {
+        V Pg[cap];
+        for (int i = 0; i < n; i++) {
+            V q(0.0);
+            for (int j = 0; j < n; j++) q += P[i * n + j] * g[j];
+            Pg[i] = q;
+        }
+        for (int i = 0; i < n; i++) {
+            V q = g[i];
+            for (int j = 0; j < n; j++) q -= W[i * n + j] * Pg[j];
+            r[i] = q;
+        }
+    }
+
+    // W <- G' W G, r <- G' r
+    inline void turn(const V* G, V* W, V* r) const {
+        V WG[cap * cap], g[cap];
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0);
+                for (int k = 0; k < n; k++) q += W[i * n + k] * G[k * n + j];
+                WG[i * n + j] = q;
+            }
+        for (int i = 0; i < n; i++) {
+            V q(0.0);
+            for (int k = 0; k < n; k++) q += G[k * n + i] * r[k];
+            g[i] = q;
+            for (int j = 0; j < n; j++) {
+                V p(0.0);
+                for (int k = 0; k < n; k++) p += G[k * n + i] * WG[k * n + j];
+                W[i * n + j] = p;
+            }
+        }
+        for (int i = 0; i < n; i++) r[i] = g[i];
+    }
+
+    template <bool renew>
+    inline void sites(int t, V* W, V* r, EpFound& f) {
+        V *m = s.m + t * n, *D = s.D + t * n;
+        for (int i = 0; i < n; i++) {
+            if (!has_site(t, i)) {
+                if (!renew && cross.S) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
+                continue;
+            }
+            const V half = larger(width(t, i), V(1e-150));
+            const V know = larger(W[i * n + i], V(1e-8) / (half * half));  // nothing known: a wide cavity
+            const V c = larger(V(1.0) / know - D[i], V(1e-12) * D[i]), mu = m[i] + r[i] / know;
+            const Tilted4 q = uniform4(mu.v, c.v, half.v);
+            note(f, m[i] + D[i] * r[i], D[i] * (V(1.0) - D[i] * know), q, mu, c);
+            if constexpr (renew) {
+                const V rest = larger(V(1.0) - of(q.var) / c, V(1e-6));  // 1 - tilted variance over the cavity's
+                const V dD = of(q.var) / rest - D[i], dm = mu + (of(q.mean) - mu) / rest - m[i];
+                const V gain = V(1.0) / larger(V(1.0) + dD * W[i * n + i], V(1e-12));
+                const V shift = (r[i] * dD + dm) * gain, shrink = dD * gain;
+                V column[cap];
+                for (int j = 0; j < n; j++) column[j] = W[j * n + i];
+                for (int j = 0; j < n; j++) {
+                    r[j] -= column[j] * shift;
+                    const V g = column[j] * shrink;
+                    for (int k = 0; k < n; k++) W[j * n + k] -= g * column[k];
+                }
+                D[i] += dD;
+                m[i] += dm;
+            } else {
+                const V spread = D[i] + c, d = m[i] - mu;
+                f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + of(log4(spread.v)) + d * d / spread);
+                f.worst = smaller(f.worst, of(q.log_z) + of(log4(2.0 * half.v)));
+                if (t > 0) {
+                    const V share = larger(V(1.0) - V(3.0) * D[i] * (V(1.0) - D[i] * know) / (half * half), V(0.0));
+                    f.slope[a.group_w[i]] += of(q.slope_s);
+                    f.learned[a.group_w[i]] += share * share;
+                }
+                if (cross.S)
+                    ratios(truncated_shape4(mu.v, c.v, -half.v, half.v), D[i] * (V(1.0) - D[i] * know),
+                           cross.w3 + t * n + i, cross.w4 + t * n + i);
+            }
+        }
+    }
+
+    // belief about x_t to the caller
+    inline void give(int t, const V* ms, const V* Ps) const {
+        for (int l = 0; l < lanes && block.first + l <= block.last; l++) {
+            const std::ptrdiff_t at = static_cast<std::ptrdiff_t>(block.first + l) * (a.T + 1) + t;
+            for (int i = 0; i < n; i++) a.x[at * n + i] = ms[i][l];
+            if (a.P)
+                for (int i = 0; i < n * n; i++) a.P[at * n * n + i] = Ps[i][l];
+        }
+    }
+
+    // ---- the whole -----------------------------------------------------------------------------------------------
+
+    void clear(EpFound& f) const {
+        f.residual = V(0.0);
+        f.far = V(0.0);
+        f.log_z = V(0.0);
+        f.worst = V(1e300);
+        for (int g = 0; g <= a.groups; g++) f.slope[g] = V(0.0);
+        for (int g = 0; g < a.groups; g++) f.learned[g] = V(0.0);
+    }
+
+    void sweep(EpFound& f, double damping) {
+        clear(f);
+        forward<true>(f, damping);
+        backward<true>(f);
+    }
+
+    // Sweep until the moments agree within `tol` in every lane that is alive; returns the sweeps. A lane is dead when its
+    // numbers are no longer finite or a factor lies thousands of standard deviations from where the others put it: no
+    // trajectory fits, and its sites run away.
+    int settle(EpFound& f, int sweeps, double tol, double damping) {
+        for (int k = 1; k <= sweeps; k++) {
+            sweep(f, damping);
+            bool done = true;
+            for (int l = 0; l < lanes; l++)
+                if (alive(f, l) && !(f.residual[l] < tol)) done = false;
+            if (done) return k;
+        }
+        return sweeps;
+    }
+    static inline bool alive(const EpFound& f, int l) { return finite(f.residual[l]) && f.far[l] < 1e8; }
+
+    // Evidence, its slopes and the belief of the sites as they are; both halves without renewing anything.
+    void look(EpFound& f) {
+        clear(f);
+        forward<false>(f, 1.0);
+        backward<false>(f);
+    }
+    static inline bool sound(const EpFound& f, int l) {
+        return finite(f.log_z[l]) && finite(f.residual[l]) && f.worst[l] > -60.0;
+    }
+};
+
+}  // namespace HW_ISA
+}  // namespace hw

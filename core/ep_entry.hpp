@@ -1,0 +1,87 @@
+// One call of expectation propagation on a chain; see core/ep.hpp.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "isa.hpp"
+#include "noise_entry.hpp"
+
+namespace hw {
+
+constexpr int ep_truncation = noise_kinds;  // a row that keeps its residual in [lo, hi]: bounds, half-spaces
+constexpr int ep_states = 16;               // most states
+
+// Matrices over time: one, one a row, or an index a row; the same for all members or one stack each.
+struct EpStack {
+    const double* data;        // (count, ...), or (members, count, ...); null: absent
+    const std::int32_t* index; // (T,) or null
+    int count;
+    std::ptrdiff_t member;     // numbers from a member's stack to the next one's; 0: shared
+};
+
+struct EpArgs {
+    int T, n, rows, groups, members;
+    EpStack A, G, Q;  // (n,n): A and Q multiplied by G = E^-1 already; G null: identity, Q null: 0
+    EpStack b;        // (T,n)
+    const double *m0, *P0, *half0;  // (n,), (n,n), (n,): x_0 = N(m0, P0) + uniform on +- half0 (0: none)
+    const std::int32_t* group_w;    // (n,): half-width of w_i; -1: no uniform part
+    // rows of stage t are start[t] .. start[t+1]-1
+    const std::int32_t* start;  // (T+2,)
+    EpStack h, y;               // (rows,n), (rows,): residual h'x - y
+    const std::int8_t* kind;    // (rows,): NoiseKind or ep_truncation
+    const std::int32_t* group;  // (rows,): half-width; -1: 0
+    const double* R;            // (rows,): variance of the Gaussian part, above 0 for noise_gaussian
+    const double *lo, *hi;      // (rows,): of truncations
+    const double* lost;         // (rows,): log density of a lost row, or null
+    const double* mix;          // (rows,groups): variance added, in units of s^2, or null
+    double wide;                // standard deviation of outliers over s
+    const double *s, *eps;      // (members,groups), (members,)
+    // sites: taken as they are if `warm`, left as they become
+    bool warm;
+    double *m, *D;     // (members,T+1,n)
+    double *tau, *nu;  // (members,rows)
+    int sweeps;        // at most
+    double tol;        // on the largest distance of moments, in standard deviations
+    double damping;    // of sites that may widen a belief
+    // found
+    double *x, *P;                 // (members,T+1,n), (members,T+1,n,n)
+    double *k3, *k4;               // (members,T+1,n): standardised cumulants of the states; or null
+    double *log_z, *slope;         // (members,), (members,groups+1)
+    double* learned;               // (members,groups): sum of (1 - posterior / prior variance)^2
+    double *residual, *worst;      // (members,)
+    double* out;                   // (members,rows) probability that a row is an outlier or lost; or null
+    std::int32_t* used;            // (members,) sweeps
+    double* work;                  // ep_workspace doubles, on a 32-byte boundary
+};
+
+// Half-widths and the rate of outliers found by evidence; see core/ep_learn.hpp. `base` has four members for the lanes
+// (its m, D, tau, nu hold one: the mode's, on the way in too if it is warm).
+struct EpLearnArgs {
+    EpArgs base;
+    const bool* free;                        // (groups,)
+    const double *floor, *cap, *scale;       // (groups,): bounds, and the order of size
+    const double *start, *was;               // (groups,): first guess; half-widths of warm sites
+    const double* count;                     // (groups,): rows of each
+    bool learn_eps;
+    double rate, start_eps;                  // the rate where it is known; logit of the first guess
+    double power, reference, warp;           // prior of log s: s^power told^reference; nodes are Gaussian in s^warp
+    double beta_a, beta_b;                   // prior of the rate
+    int steps, few, many, most;              // Newton steps; sweeps of a step, of the first one, of a node
+    double tol, tol_nodes, close, least, narrow;
+    int nodes;
+    const double *z, *log_proposal;          // (nodes, q), (nodes,)
+    // found
+    double *mode, *H, *phi, *log_weight;     // (q,), (q,q), (nodes,q), (nodes,)
+    double *x, *P, *k3, *k4, *centre, *out;  // (T+1,n), (T+1,n,n), ...: of the mixture; out (rows,) or null
+    double *log_evidence, *log_mode, *log_prior, *residual;  // of the data; Z times prior, and the prior, at the mode
+    std::int32_t* used;                      // nodes
+    long* sweeps_used;
+};
+
+}  // namespace hw
+
+HW_KERNEL(std::size_t, ep_workspace, const hw::EpArgs& args)
+HW_KERNEL(int, ep_run, const hw::EpArgs& args)
+HW_KERNEL(std::size_t, ep_learn_workspace, const hw::EpLearnArgs& args)
+HW_KERNEL(int, ep_learn, const hw::EpLearnArgs& args)

@@ -1,0 +1,438 @@
+// Half-widths (and the rate of outliers) by evidence, and what is not known of them carried into the beliefs.
+//
+// phi = log s of the free half-widths, logit eps last if it is learned. The prior of a rate is a beta law. That of log s is
+// s^power told^reference on (floor, cap), told^2 = mean over the rows of (1 - posterior variance / (s^2 / 3))^2: the square
+// root of what a row tells of log s (Jeffreys) and a power, 0 where the noise drowns and steady where it is seen. It has
+// no scale of its own. log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the
+// four lanes one holds phi, three hold phi + h e_j, whose slopes give three columns of the Hessian, other coordinates at
+// the next step. Around the mode, `nodes` points phi + H^(-1/2) z_k are evaluated and weighted by evidence over
+// proposal; the answer is their mixture. A half-width that may as well be 0 has an exponential tail in log s and none in a
+// power of s, so the search and the nodes live in u = s^warp (its density has the prior s^(a-warp) in log s, and at its
+// mode the two Hessians differ by du/dphi only). Sites follow phi from point to point, so a point costs few sweeps.
+#pragma once
+
+#include "ep.hpp"
+
+namespace hw {
+namespace HW_ISA {
+
+constexpr int ep_free = 16;  // most free parameters
+
+template <class N>
+struct EpLearner {
+    Ep<N>& ep;
+    const EpLearnArgs& a;
+    EpFound f;
+    V *keep_m, *keep_D, *keep_tau, *keep_nu;  // sites of the best point
+    V* was;                                   // (groups,)
+    int q = 0;                                // parameters
+    int group[ep_free];                       // half-width of a parameter, -1: the rate
+    double lo[ep_free], hi[ep_free];
+    long sweeps = 0;
+
+    std::ptrdiff_t stage_count() const { return static_cast<std::ptrdiff_t>(a.base.T + 1) * ep.n; }
+
+    int parameters() {
+        const EpArgs& b = a.base;
+        for (int g = 0; g < b.groups; g++)
+            if (a.free[g]) {
+                if (q == ep_free) return -1;
+                group[q] = g;
+                lo[q] = std::log(max2(a.floor[g], 1e-12 * a.scale[g]));
+                hi[q] = std::log(min2(a.cap[g], 1e3 * a.scale[g]));
+                q++;
+            }
+        if (a.learn_eps) {
+            if (q == ep_free) return -1;
+            group[q] = -1;
+            lo[q] = -14.0;
+            hi[q] = 1.5;
+            q++;
+        }
+        return q;
+    }
+
+    // share of a half-width's noise that the data tell, of lane l: 0 nothing, 1 all
+    double told(int j, int l) const {
+        return std::sqrt(min2(max2(f.learned[group[j]][l] / max2(a.count[group[j]], 1.0), 1e-12), 1.0));
+    }
+    double log_prior(const double* phi, int l) const {
+        double p = 0.0;
+        for (int j = 0; j < q; j++)
+            p += group[j] >= 0 ? (a.power - a.warp) * phi[j] + a.reference * std::log(told(j, l))
+                               : a.beta_a * phi[j] - (a.beta_a + a.beta_b) * std::log1p(std::exp(phi[j]));
+        return p;
+    }
+    // What is told grows with s^2 / (s^2 + what blurs it), so d log told / d log s = 2 (1 - told), near enough for a search.
+    double prior_slope(int j, double phi, int l) const {
+        return group[j] >= 0 ? a.power - a.warp + 2.0 * a.reference * (1.0 - told(j, l))
+                             : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi));
+    }
+
+    // parameters of lane l
+    void put(int l, const double* phi) {
+        for (int j = 0; j < q; j++) {
+            if (group[j] >= 0) ep.s.s[group[j]].set(l, std::exp(phi[j]));
+            else ep.s.eps.set(l, 1.0 / (1.0 + std::exp(-phi[j])));
+        }
+    }
+    void remember(int l) {
+        for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
+            keep_m[k] = V(ep.s.m[k][l]);
+            keep_D[k] = V(ep.s.D[k][l]);
+        }
+        for (int k = 0; k < a.base.rows; k++) {
+            keep_tau[k] = V(ep.s.tau[k][l]);
+            keep_nu[k] = V(ep.s.nu[k][l]);
+        }
+        for (int g = 0; g < a.base.groups; g++) was[g] = V(ep.s.s[g][l]);
+    }
+    // every lane starts from the remembered sites, drawn along with its own half-widths
+    void recall() {
+        for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
+            ep.s.m[k] = keep_m[k];
+            ep.s.D[k] = keep_D[k];
+        }
+        for (int k = 0; k < a.base.rows; k++) {
+            ep.s.tau[k] = keep_tau[k];
+            ep.s.nu[k] = keep_nu[k];
+        }
+        ep.rescale(was);
+        if (dirty) ep.forget();
+        dirty = false;
+    }
+    bool dirty = false;  // the message may hold what is not finite
+
+    // evaluate the lanes; value[l] = log posterior up to a constant, slope[l][j]
+    void evaluate(const double (*phi)[ep_free], int most, double tol, double* value, double (*slope)[ep_free]) {
+        sweeps += ep.settle(f, most, tol, a.base.damping);
+        ep.look(f);
+        sweeps++;
+        for (int l = 0; l < lanes; l++) {
+            const bool sound = ep.sound(f, l);
+            if (!sound) dirty = true;
+            value[l] = sound ? f.log_z[l] + log_prior(phi[l], l) : minus_inf;
+            for (int j = 0; j < q; j++)
+                slope[l][j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l] + prior_slope(j, phi[l][j], l);
+        }
+    }
+
+    // H (q,q) from its measured columns: symmetric, with every curvature at least `least` of the mean one
+    void hessian(const double (*column)[ep_free], double (*H)[ep_free]) const {
+        for (int i = 0; i < q; i++)
+            for (int j = 0; j < q; j++) H[i][j] = 0.5 * (column[i][j] + column[j][i]);
+        for (int i = 0; i < q; i++) H[i][i] = max2(H[i][i], a.least);
+        // shrink couplings until the factor exists
+        for (double keep = 1.0; keep > 0.01; keep *= 0.7) {
+            double L[ep_free][ep_free];
+            if (factor(H, keep, L)) {
+                for (int i = 0; i < q; i++)
+                    for (int j = 0; j < q; j++)
+                        if (i != j) H[i][j] *= keep;
+                return;
+            }
+        }
+        for (int i = 0; i < q; i++)
+            for (int j = 0; j < q; j++)
+                if (i != j) H[i][j] = 0.0;
+    }
+    bool factor(const double (*H)[ep_free], double keep, double (*L)[ep_free]) const {
+        for (int j = 0; j < q; j++) {
+            double p = H[j][j];
+            for (int k = 0; k < j; k++) p -= L[j][k] * L[j][k];
+            if (!(p > 0.05 * H[j][j])) return false;
+            L[j][j] = std::sqrt(p);
+            for (int i = j + 1; i < q; i++) {
+                double s = keep * H[i][j];
+                for (int k = 0; k < j; k++) s -= L[i][k] * L[j][k];
+                L[i][j] = s / L[j][j];
+            }
+        }
+        return true;
+    }
+
+    // Newton step over the parameters that are not held at a bound; returns its length in standard deviations
+    double step(const double (*H)[ep_free], const double* phi, const double* g, double* d) const {
+        int open[ep_free], k = 0;
+        for (int j = 0; j < q; j++) {
+            d[j] = 0.0;
+            const bool held = (phi[j] >= hi[j] - 1e-9 && g[j] > 0) || (phi[j] <= lo[j] + 1e-9 && g[j] < 0);
+            if (!held) open[k++] = j;
+        }
+        double M[ep_free * ep_free], L[ep_free * ep_free], p[ep_free], pi[ep_free], x[ep_free];
+        for (int i = 0; i < k; i++) {
+            x[i] = g[open[i]];
+            for (int j = 0; j < k; j++) M[i * k + j] = H[open[i]][open[j]];
+        }
+        if (k == 0) return 0.0;
+        ldl(Dim<0>(k), M, L, p, pi);
+        ldl_solve(Dim<0>(k), Dim<1>(), L, pi, x);
+        double far = 0.0;
+        for (int i = 0; i < k; i++) {
+            const int j = open[i];
+            double to = phi[j] + min2(max2(x[i], -0.8), 0.8);
+            to = min2(max2(to, lo[j]), hi[j]);
+            d[j] = to - phi[j];
+            far = max2(far, std::fabs(d[j]) * std::sqrt(H[j][j]));
+        }
+        return far;
+    }
+
+    // climb from phi to the mode; H at the end; returns 0, 1: not converged, 2: no sound point
+    int climb(double* phi, double (*H)[ep_free], double* best, bool warm) {
+        double column[ep_free][ep_free] = {}, g[ep_free] = {};
+        bool measured[ep_free] = {};
+        for (int j = 0; j < q; j++) column[j][j] = max2(group[j] >= 0 ? 0.3 * a.count[group[j]] : 1.0, a.least);
+        int next = 0, missing = q;
+        *best = minus_inf;
+        double d[ep_free] = {}, trial[ep_free];
+        double length = 1e9;
+        int refused = 0;
+        for (int k = 0; k < a.steps; k++) {
+            double at[lanes][ep_free], value[lanes], slope[lanes][ep_free], h[lanes] = {};
+            int along[lanes] = {-1, -1, -1, -1};
+            for (int j = 0; j < q; j++) trial[j] = min2(max2(phi[j] + d[j], lo[j]), hi[j]);
+            for (int l = 0; l < lanes; l++) {
+                for (int j = 0; j < q; j++) at[l][j] = trial[j];
+                if (l == 0 || l > q) continue;
+                const int j = next;
+                next = (next + 1) % q;
+                h[l] = min2(max2(0.5 / std::sqrt(column[j][j]), 0.01), 0.15);
+                if (trial[j] + h[l] > hi[j]) h[l] = -h[l];
+                along[l] = j;
+                at[l][j] += h[l];
+            }
+            for (int l = 0; l < lanes; l++) put(l, at[l]);
+            if (k > 0 || warm) recall();
+            else ep.start();
+            evaluate(at, k > 0 || warm ? a.few : a.many, a.tol, value, slope);
+            if (!(value[0] > *best - 0.05 * q) && refused < 6) {  // too far, or no trajectory fits
+                refused++;
+                if (*best == minus_inf) {  // the start itself: wider half-widths fit more
+                    for (int j = 0; j < q; j++) phi[j] = min2(max2(phi[j] + (group[j] >= 0 ? 0.7 : 0.0), lo[j]), hi[j]);
+                    ep.start();
+                    dirty = false;
+                    remember(0);
+                    warm = false;
+                    k = -1;
+                    if (refused == 6) return 2;
+                } else {
+                    for (int j = 0; j < q; j++) d[j] *= 0.3;
+                }
+                continue;
+            }
+            if (value[0] == minus_inf) return 2;
+            refused = 0;
+            *best = value[0];
+            *a.log_prior = log_prior(trial, 0);
+            for (int j = 0; j < q; j++) {
+                phi[j] = trial[j];
+                g[j] = slope[0][j];
+            }
+            for (int l = 1; l < lanes; l++)
+                if (along[l] >= 0 && value[l] > minus_inf) {
+                    for (int i = 0; i < q; i++) column[along[l]][i] = -(slope[l][i] - slope[0][i]) / h[l];
+                    // an unmeasured column mirrors a measured one
+                    for (int i = 0; i < q; i++)
+                        if (!measured[i] && i != along[l]) column[i][along[l]] = column[along[l]][i];
+                    if (!measured[along[l]]) missing--;
+                    measured[along[l]] = true;
+                }
+            remember(0);
+            hessian(column, H);
+            length = step(H, phi, g, d);
+            if (length < a.close && missing == 0) return 0;
+        }
+        return length < 1.0 ? 0 : 1;
+    }
+
+    // The mixture over the nodes is kept as weighted raw moments about the first node's mean.
+    void scale_sums(double by) {
+        const std::ptrdiff_t size = stage_count(), square = size * ep.n;
+        for (std::ptrdiff_t k = 0; k < size; k++) {
+            a.x[k] *= by;
+            a.k3[k] *= by;
+            a.k4[k] *= by;
+        }
+        for (std::ptrdiff_t k = 0; k < square; k++) a.P[k] *= by;
+        if (a.out)
+            for (int k = 0; k < a.base.rows; k++) a.out[k] *= by;
+    }
+    void add(int l, double weight) {
+        const EpArgs& b = a.base;
+        const int n = ep.n;
+        for (int t = 0; t <= b.T; t++) {
+            const std::ptrdiff_t from = (static_cast<std::ptrdiff_t>(l) * (b.T + 1) + t) * n, to = static_cast<std::ptrdiff_t>(t) * n;
+            for (int i = 0; i < n; i++) {
+                const double d = b.x[from + i] - a.centre[to + i], v = max2(b.P[(from + i) * n + i], 0.0), sd = std::sqrt(v);
+                const double m3 = b.k3[from + i] * v * sd, m4 = (b.k4[from + i] + 3.0) * v * v;
+                a.x[to + i] += weight * d;
+                a.k3[to + i] += weight * (m3 + 3.0 * v * d + d * d * d);
+                a.k4[to + i] += weight * (m4 + 4.0 * m3 * d + 6.0 * v * d * d + d * d * d * d);
+                for (int j = 0; j < n; j++)
+                    a.P[(to + i) * n + j] += weight * (b.P[(from + i) * n + j] + d * (b.x[from + j] - a.centre[to + j]));
+            }
+        }
+        if (a.out)
+            for (int k = 0; k < b.rows; k++) a.out[k] += weight * b.out[static_cast<std::ptrdiff_t>(l) * b.rows + k];
+    }
+    void finish(double sum) {
+        const int n = ep.n;
+        scale_sums(1.0 / sum);
+        for (int t = 0; t <= a.base.T; t++) {
+            const std::ptrdiff_t to = static_cast<std::ptrdiff_t>(t) * n;
+            for (int i = 0; i < n; i++) {
+                const double d = a.x[to + i], raw2 = a.P[(to + i) * n + i], v = max2(raw2 - d * d, 1e-300);
+                const double m3 = a.k3[to + i] - 3.0 * d * raw2 + 2.0 * d * d * d;
+                const double m4 = a.k4[to + i] - 4.0 * d * a.k3[to + i] + 6.0 * d * d * raw2 - 3.0 * d * d * d * d;
+                a.k3[to + i] = m3 / (v * std::sqrt(v));
+                a.k4[to + i] = m4 / (v * v) - 3.0;
+            }
+            for (int i = 0; i < n; i++)
+                for (int j = 0; j < n; j++) a.P[(to + i) * n + j] -= a.x[to + i] * a.x[to + j];
+            for (int i = 0; i < n; i++) a.x[to + i] += a.centre[to + i];
+        }
+    }
+
+    int run() {
+        const EpArgs& b = a.base;
+        if (parameters() < 0) return 3;
+        double phi[ep_free] = {}, H[ep_free][ep_free] = {}, L[ep_free][ep_free] = {};
+        for (int j = 0; j < q; j++) {
+            const double start = group[j] >= 0 ? std::log(max2(a.start[group[j]], 1e-300)) : a.start_eps;
+            phi[j] = min2(max2(start, lo[j]), hi[j]);
+        }
+        for (int l = 0; l < lanes; l++) {
+            for (int g = 0; g < b.groups; g++) ep.s.s[g].set(l, a.start[g]);
+            ep.s.eps.set(l, a.rate);
+            put(l, phi);
+        }
+        const bool warm = b.warm;
+        if (warm) {
+            for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
+                keep_m[k] = V(b.m[k]);
+                keep_D[k] = V(b.D[k]);
+            }
+            for (int k = 0; k < b.rows; k++) {
+                keep_tau[k] = V(b.tau[k]);
+                keep_nu[k] = V(b.nu[k]);
+            }
+            for (int g = 0; g < b.groups; g++) was[g] = V(a.was[g]);
+            ep.forget();
+        }
+        const EpCross wanted = ep.cross;
+        ep.cross = EpCross{};
+        double best = minus_inf;
+        *a.log_prior = 0.0;
+        int code = 0;
+        if (q > 0) {
+            code = climb(phi, H, &best, warm);
+            if (code == 2) return 2;
+            for (double keep = 1.0; !factor(H, keep, L); keep *= 0.7) {}
+        } else {
+            double at[lanes][ep_free] = {}, value[lanes], slope[lanes][ep_free];
+            if (warm) recall();
+            else ep.start();
+            evaluate(at, a.most, a.tol_nodes, value, slope);
+            if (value[0] == minus_inf) return 2;
+            best = value[0];
+            if (!(f.residual[0] < a.tol_nodes)) code = 1;
+            remember(0);
+        }
+        for (int j = 0; j < q; j++) {
+            a.mode[j] = phi[j];
+            for (int i = 0; i < q; i++) a.H[j * q + i] = H[j][i];
+        }
+        // sites of the mode, for a warm start
+        for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
+            b.m[k] = keep_m[k][0];
+            b.D[k] = keep_D[k][0];
+        }
+        for (int k = 0; k < b.rows; k++) {
+            b.tau[k] = keep_tau[k][0];
+            b.nu[k] = keep_nu[k][0];
+        }
+        // Little is left to be known of the parameters: one node does.
+        double wide = 0.0;
+        for (int j = 0; j < q; j++) wide = max2(wide, 1.0 / std::sqrt(H[j][j]));
+        const int nodes = q == 0 || wide < a.narrow ? 1 : a.nodes;
+        *a.used = nodes;
+        ep.cross = wanted;
+        const std::ptrdiff_t size = stage_count();
+        for (std::ptrdiff_t k = 0; k < size; k++) a.x[k] = a.k3[k] = a.k4[k] = 0.0;
+        for (std::ptrdiff_t k = 0; k < size * ep.n; k++) a.P[k] = 0.0;
+        if (a.out)
+            for (int k = 0; k < b.rows; k++) a.out[k] = 0.0;
+        double top = minus_inf, sum = 0.0;
+        *a.residual = 0.0;
+        bool first = true;
+        for (int k = 0; k < nodes; k += lanes) {
+            double at[lanes][ep_free], value[lanes], slope[lanes][ep_free];
+            bool inside[lanes];
+            for (int l = 0; l < lanes; l++) {
+                inside[l] = k + l < nodes;
+                for (int j = 0; j < q; j++) at[l][j] = phi[j];
+                if (nodes > 1 && inside[l]) {
+                    double x[ep_free];
+                    for (int i = q - 1; i >= 0; i--) {  // L' x = z
+                        double s = a.z[(k + l) * q + i];
+                        for (int j = i + 1; j < q; j++) s -= L[j][i] * x[j];
+                        x[i] = s / L[i][i];
+                    }
+                    for (int j = 0; j < q; j++) {
+                        const double u = 1.0 + a.warp * x[j];  // s^warp over the mode's
+                        at[l][j] = group[j] < 0 ? phi[j] + x[j] : u > 0.0 ? phi[j] + std::log(u) / a.warp : lo[j] - 1.0;
+                        if (at[l][j] > hi[j] || at[l][j] < lo[j]) inside[l] = false;
+                    }
+                    if (!inside[l])
+                        for (int j = 0; j < q; j++) at[l][j] = phi[j];
+                }
+                put(l, at[l]);
+            }
+            recall();
+            evaluate(at, a.most, a.tol_nodes, value, slope);
+            ep.shapes(b.k3, b.k4);
+            for (int l = 0; l < lanes && k + l < nodes; l++) {
+                for (int j = 0; j < q; j++) a.phi[(k + l) * q + j] = at[l][j];
+                double lw = inside[l] && value[l] > minus_inf ? value[l] - (nodes > 1 ? a.log_proposal[k + l] : 0.0) : minus_inf;
+                a.log_weight[k + l] = lw;
+                if (lw == minus_inf) continue;
+                if (first) {
+                    for (std::ptrdiff_t i = 0; i < size; i++) a.centre[i] = b.x[l * size + i];
+                    first = false;
+                }
+                if (lw > top) {
+                    if (sum > 0) {
+                        const double by = std::exp(top - lw);
+                        scale_sums(by);
+                        sum *= by;
+                        *a.residual *= by;
+                    }
+                    top = lw;
+                }
+                const double w = std::exp(lw - top);
+                sum += w;
+                *a.residual += w * f.residual[l];
+                add(l, w);
+            }
+        }
+        if (!(sum > 0.0)) return 2;
+        finish(sum);
+        *a.residual /= sum;
+        double half_log_det = 0.0;
+        for (int j = 0; j < q; j++) {
+            const double to_phi = group[j] >= 0 ? a.warp * phi[j] : 0.0;
+            half_log_det += std::log(L[j][j]) - to_phi;
+            *a.log_prior += to_phi;
+            best += to_phi;
+        }
+        *a.log_mode = best;
+        *a.log_evidence = nodes > 1 ? top + std::log(sum / nodes) - half_log_det
+                                    : top + 0.5 * q * log_2pi - half_log_det;
+        *a.sweeps_used = sweeps;
+        return code;
+    }
+};
+
+}  // namespace HW_ISA
+}  // namespace hw

@@ -1,0 +1,205 @@
+"""The posterior with unknown entries theta of A, B, C, E, F: evidence climbed over theta, then integrated.
+
+Half-widths are found anew for every theta. The prior of theta is flat within ``theta_bounds``. Around the mode the
+evidence is evaluated at weighted nodes, and the answer is the mixture of theirs.
+"""
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from halfwidth.array import Array
+from halfwidth.methods.sequential import filled
+from halfwidth.model import Linear
+from halfwidth.record import Record
+from halfwidth.result import Estimate, Status
+from halfwidth.spread import Shaped
+
+if TYPE_CHECKING:
+    from halfwidth.methods.posterior import Answer, Posterior, Start
+
+_STEPS = 40
+_NODES = 24
+
+
+def with_entries(method: "Posterior", model: Linear, record: Record) -> Estimate:
+    """Estimate states, half-widths and unknown entries of one record."""
+    from halfwidth.methods.posterior import nodes
+
+    search = _Search(method, model, record)
+    theta, converged = search.climb()
+    if search.best is None:
+        return search.failed()
+    L = search.width(theta)
+    p = len(theta)
+    z, log_proposal = nodes(p, _NODES)
+    inner = replace(method, nodes=max(1, method.nodes // 4))
+    found: list[tuple[float, Array, Estimate]] = []
+    for k in range(len(z)):
+        at = theta + L @ z[k]
+        if np.any(at < search.lo) or np.any(at > search.hi):
+            continue
+        answer = inner.answer(search.model(at), record, start=search.start)
+        if answer.estimate.status.good:
+            found.append((float(answer.found["log_evidence"]) - float(log_proposal[k]), at, answer.estimate))
+    if not found:
+        found = [(0.0, theta, search.best.estimate)]
+    return _mixture(method, model, found, search, converged, L)
+
+
+class _Search:
+    """The evidence as a function of theta."""
+
+    def __init__(self, method: "Posterior", model: Linear, record: Record) -> None:
+        self.method, self.asked, self.record = replace(method, nodes=1), model, record
+        p = len(model.theta_entries)
+        box = model.theta_bounds
+        self.lo = np.full(p, -np.inf) if box is None else np.array(box.lo)
+        self.hi = np.full(p, np.inf) if box is None else np.array(box.hi)
+        self.first = np.zeros(p) if box is None else np.array(box.mean)
+        self.start: Start | None = None
+        self.best: Answer | None = None
+        self.value = -math.inf
+
+    def model(self, theta: Array) -> Linear:
+        """Return the model with its unknown entries filled in."""
+        return filled(self.asked, theta)
+
+    def at(self, theta: Array) -> float:
+        """Return log evidence at the mode of the half-widths, and keep the best."""
+        answer = self.method.answer(self.model(theta), self.record, start=self.start)
+        if not np.isfinite(answer.found["log_mode"]) or int(answer.found["code"]) >= 2:
+            return -math.inf
+        value = float(answer.found["log_mode"])
+        if value > self.value:
+            self.value, self.best, self.start = value, answer, answer.start
+        return value
+
+    def slope(self, theta: Array, size: Array) -> tuple[Array, Array]:
+        """Return gradient and diagonal of the Hessian by central differences."""
+        here, g, d = self.at(theta), np.zeros(len(theta)), np.zeros(len(theta))
+        for k, h in enumerate(size):
+            step = np.zeros(len(theta))
+            step[k] = h
+            up, down = self.at(theta + step), self.at(theta - step)
+            if math.isinf(up) or math.isinf(down):
+                g[k] = 0.0 if math.isinf(up) and math.isinf(down) else (1.0 if math.isinf(down) else -1.0) / h
+                d[k] = -1.0 / h**2
+            else:
+                g[k], d[k] = (up - down) / (2 * h), (up + down - 2 * here) / h**2
+        return g, d
+
+    def climb(self) -> tuple[Array, bool]:
+        """Climb by a quasi-Newton search within the bounds."""
+        from scipy.optimize import minimize
+
+        theta = self.first
+        if math.isinf(self.at(theta)):
+            return theta, False
+        span = np.where(np.isfinite(self.hi - self.lo), self.hi - self.lo, 1.0)
+        size = 1e-3 * span
+
+        def cost(v: Array) -> tuple[float, Array]:
+            value = self.at(v)
+            if math.isinf(value):
+                return 1e10, np.zeros(len(v))
+            return -value, -self.slope(v, size)[0]
+
+        bounds = list(zip(self.lo + size, self.hi - size, strict=True))
+        found = minimize(
+            cost, np.clip(theta, self.lo + size, self.hi - size), jac=True, method="L-BFGS-B", bounds=bounds,
+            options={"maxiter": _STEPS, "ftol": 1e-7, "gtol": 1e-2},
+        )  # fmt: skip
+        return np.asarray(found.x), bool(found.success) or "ABNORMAL" in str(found.message)
+
+    def width(self, theta: Array) -> Array:
+        """Return a factor of the covariance of theta at the mode."""
+        p = len(theta)
+        span = np.where(np.isfinite(self.hi - self.lo), self.hi - self.lo, np.maximum(np.abs(theta), 1.0))
+        _, d = self.slope(theta, 1e-3 * span)
+        sd = 1.0 / np.sqrt(np.maximum(-d, 1.0 / span**2))
+        h = 0.5 * sd  # steps that the evidence notices, whatever its rounding
+        here = self.at(theta)
+        H = np.zeros((p, p))
+        for i in range(p):
+            for j in range(i + 1):
+                a, b = np.zeros(p), np.zeros(p)
+                a[i], b[j] = h[i], h[j]
+                if i == j:
+                    v = (self.at(theta + a) + self.at(theta - a) - 2 * here) / h[i] ** 2
+                else:
+                    plus = self.at(theta + a + b) + self.at(theta - a - b)
+                    v = (plus - self.at(theta + a - b) - self.at(theta - a + b)) / (4 * h[i] * h[j])
+                H[i, j] = H[j, i] = -v if np.isfinite(v) else (1.0 / sd[i] ** 2 if i == j else 0.0)
+        value, vector = np.linalg.eigh(H * np.outer(sd, sd))
+        root = vector / np.sqrt(np.maximum(value, 0.1))
+        return np.asarray(sd[:, None] * root)
+
+    def failed(self) -> Estimate:
+        """Return what is said where no value of theta that was tried fits."""
+        est = self.method.answer(self.model(self.first), self.record).estimate
+        return replace(est, theta=None)
+
+
+def _mixture(
+    method: "Posterior", model: Linear, found: list[tuple[float, Array, Estimate]], search: _Search, converged: bool,
+    L: Array,
+) -> Estimate:  # fmt: skip
+    from halfwidth.methods._protocol import typed
+
+    top = max(f[0] for f in found)
+    weight = np.array([math.exp(f[0] - top) for f in found])
+    total = float(weight.sum())
+    weight /= total
+    thetas = np.array([f[1] for f in found])
+    first = search.best
+    assert first is not None
+
+    def mean(values: list[Any]) -> Array:
+        return np.asarray(np.tensordot(weight, np.array(values), 1))
+
+    ests = [f[2] for f in found]
+    x = mean([e.x for e in ests])
+    P, m3, m4 = np.zeros((*x.shape, x.shape[1])), np.zeros(x.shape), np.zeros(x.shape)
+    for w, e in zip(weight, ests, strict=True):
+        d = e.x - x
+        cov = np.asarray(e.P)
+        v = np.diagonal(cov, axis1=1, axis2=2)
+        shape = e.spread if isinstance(e.spread, Shaped) else None
+        k3, k4 = (shape.skew, shape.kurt) if shape is not None else (0.0, 0.0)
+        P += w * (cov + d[:, :, None] * d[:, None, :])
+        third = k3 * v**1.5
+        m3 += w * (third + 3 * v * d + d**3)
+        m4 += w * ((k4 + 3) * v**2 + 4 * third * d + 6 * v * d**2 + d**4)
+    v = np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300)
+    est = first.estimate
+    within = getattr(est.spread, "within", None)
+    theta = weight @ thetas
+    effective = float(1.0 / (weight @ weight))
+    sd = np.sqrt(weight @ (thetas - theta) ** 2) if len(found) > 1 else np.sqrt((L**2).sum(axis=1))
+    status = est.status
+    if status.good and (not converged or effective < 2.0):
+        status = Status.REDUCED
+    info = dict(est.info) | {
+        "theta_sd": sd,
+        "theta_nodes": len(found),
+        "theta_effective": effective,
+        "x0": mean([e.info["x0"] for e in ests]),
+    }
+    if all(e.status.good for e in ests):
+        info["half_widths"] = {k: mean([e.info["half_widths"][k] for e in ests]) for k in ("mean", "sd", "lo", "hi")}
+    return replace(
+        est,
+        x=x,
+        spread=Shaped(x, P, m3 / v**1.5, m4 / v**2 - 3.0, within),
+        status=status,
+        method=typed(method),
+        q=None if est.q is None else mean([e.q for e in ests]),
+        r=None if est.r is None else mean([e.r for e in ests]),
+        theta=theta,
+        loglik=float(top + math.log(total / _NODES) - np.linalg.slogdet(np.linalg.inv(L))[1]),
+        names=model.names.x,
+        info=info,
+    )

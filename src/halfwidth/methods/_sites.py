@@ -1,0 +1,342 @@
+"""A linear model over one record as a chain with factors on linear functionals: what `halfwidth._core.ep_*` take.
+
+``x[t] = E^-1 (A x[t-1] + B u[t] + w[t])`` carries one factor on each w that has a uniform part; the rows of a stage are
+its seen outputs, ``h'x - y = e``, and the bounds. An unseen output that a seen one is correlated with through F is
+eliminated, and its half-width counts as variance of that row (as in `_residuals`).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.array import Array
+from halfwidth.methods._residuals import _eliminate, first_scales, reference, residuals
+from halfwidth.model import Linear
+from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
+from halfwidth.record import Record
+from halfwidth.spread import Box, Normal
+from halfwidth.varying import Varying
+
+GAUSSIAN, UNIFORM, UNIFORM_GAUSSIAN, CONTAMINATED, MAYBE_LOST, TRUNCATION = range(6)
+#: Standard deviation of an outlier in half-widths.
+WIDE = 10.0
+#: Variances below this share of the output's own scale, squared, count as no noise: information must stay finite.
+_EXACT = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Sites:
+    """The arrays of a problem, and which half-widths are to be found.
+
+    Parameters
+    ----------
+    problem : dict
+        For the core.
+    free : (p,) bool array
+        Half-widths (q, r) that are unknown and have rows.
+    floor, cap, scale, count : (p,) arrays
+        Bounds, order of size, and number of rows of each half-width.
+    uniform : (p,) bool array
+        Which entries have a half-width at all.
+    row, output : (K,) int arrays
+        Row of the record and output of each row of the chain; -1 where it is a bound.
+    """
+
+    problem: dict[str, Any]
+    free: NDArray[np.bool_]
+    floor: Array
+    cap: Array
+    scale: Array
+    count: Array
+    uniform: NDArray[np.bool_]
+    row: NDArray[np.intp]
+    output: NDArray[np.intp]
+
+    @property
+    def exact(self) -> bool:
+        """Whether every factor is Gaussian, so that one sweep is the answer."""
+        kind = self.problem["kind"]
+        return bool(
+            (kind == GAUSSIAN).all() and (self.problem["group_w"] < 0).all() and not self.problem["half0"].any()
+        )
+
+
+def sites(model: Linear, record: Record, *, outliers: bool = False) -> Sites:
+    """Build the chain of a model without unknown entries."""
+    T, nx, ny = len(record), model.nx, model.ny
+    dt = record.steps(model.dt)
+    p = nx + ny
+    floor, cap, uniform = _half_widths(model)
+    scale = first_scales(model, [record.y[record.seen[:, j], j] for j in range(ny)])
+    problem: dict[str, Any] = {"groups": p, "wide": WIDE}
+    _dynamics(problem, model, record, dt)
+    _first_state(problem, model, record)
+    w_group = np.where(uniform[:nx] & (cap[:nx] > 0), np.arange(nx), -1)
+    problem["group_w"] = w_group.astype(np.int32)
+    rows = _outputs(model, record, dt, scale, outliers)
+    rows += _bounds(model, T, scale)
+    rows += _first_bounds(model)
+    stage = np.concatenate([r.stage for r in rows]) if rows else np.zeros(0, dtype=np.intp)
+    order = np.argsort(stage, kind="stable")
+    problem["start"] = np.searchsorted(stage[order], np.arange(T + 2)).astype(np.int32)
+
+    def joined(name: str, dtype: Any, shape: tuple[int, ...] = ()) -> Any:
+        if not rows:
+            return np.zeros((0, *shape), dtype=dtype)
+        return np.ascontiguousarray(np.concatenate([getattr(r, name) for r in rows])[order], dtype=dtype)
+
+    problem["h"] = joined("h", float, (nx,))
+    for name, dtype in (
+        ("y", float),
+        ("kind", np.int8),
+        ("group", np.int32),
+        ("R", float),
+        ("lo", float),
+        ("hi", float),
+    ):
+        problem[name] = joined(name, dtype)
+    lost, mix = joined("lost", float), joined("mix", float, (p,))
+    problem["lost"] = lost if (problem["kind"] == MAYBE_LOST).any() else None
+    problem["mix"] = mix if mix.any() else None
+    output = joined("output", np.intp)
+    count = np.r_[np.full(nx, float(T)), [float(np.count_nonzero(output == j)) for j in range(ny)]]
+    free = uniform & (floor < cap) & (count > 0)
+    return Sites(problem, free, floor, cap, scale, count, uniform, stage[order] - 1, output)
+
+
+def _half_widths(model: Linear) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return floors and caps of the half-widths (q, r), 0 where a noise has none, and which have one; each (p,)."""
+    parts: list[tuple[Array, Array, NDArray[np.bool_]]] = []
+    for noise, n in ((model.w, model.nx), (model.e, model.ny)):
+        box = uniform_part(noise)
+        if box is None:
+            parts.append((np.zeros(n), np.zeros(n), np.zeros(n, dtype=bool)))
+        else:
+            parts.append((np.atleast_1d(box.at_least), np.atleast_1d(box.at_most), np.ones(n, dtype=bool)))
+    return (
+        np.concatenate([f[0] for f in parts]),
+        np.concatenate([f[1] for f in parts]),
+        np.concatenate([f[2] for f in parts]),
+    )
+
+
+def uniform_part(noise: Noise) -> Uniform | None:
+    """Return the bounded part of a noise, if it has one."""
+    return noise if isinstance(noise, Uniform) else noise.uniform if isinstance(noise, Mixed) else None
+
+
+def gaussian_part(noise: Noise) -> Gaussian | None:
+    """Return the Gaussian part of a noise, if it has one."""
+    return noise if isinstance(noise, Gaussian) else noise.gaussian if isinstance(noise, Mixed) else None
+
+
+def _every(matrix: Varying, record: Record, dt: Array) -> Array:
+    stack, index = matrix.stack(record.t, dt)
+    return np.broadcast_to(stack, (len(record), *stack.shape[1:])) if index is None else stack[index]
+
+
+def _one(matrix: Varying | None, record: Record, dt: Array) -> tuple[Array, NDArray[np.int32] | None]:
+    """Return the distinct matrices and the index of each row, None where one serves all or each has its own."""
+    assert matrix is not None
+    return matrix.stack(record.t, dt)
+
+
+def _dynamics(problem: dict[str, Any], model: Linear, record: Record, dt: Array) -> None:
+    T, nx = len(record), model.nx
+    part = gaussian_part(model.w)
+    problem["G"] = problem["G_index"] = problem["Q"] = problem["Q_index"] = None
+    A, A_index = _one(model.A, record, dt)
+    b = np.zeros((T, nx))
+    if model.B is not None and record.u is not None:
+        b = np.einsum("tij,tj->ti", _every(model.B, record, dt), record.u)
+    Q = None if part is None else part.cov()
+    if Q is not None:
+        problem["Q"], problem["Q_index"] = _one(Q, record, dt)
+    if model.E is not None:
+        if model.E.constant:
+            G = np.linalg.inv(model.E.single)[None]
+            A = G @ A
+            b = b @ G[0].T
+            if Q is not None:
+                problem["Q"] = G @ problem["Q"] @ G[0].T
+        else:
+            G = np.linalg.inv(_every(model.E, record, dt))
+            A, A_index = G @ _every(model.A, record, dt), None
+            b = np.einsum("tij,tj->ti", G, b)
+            if Q is not None:
+                problem["Q"], problem["Q_index"] = G @ _every(Q, record, dt) @ np.swapaxes(G, 1, 2), None
+        problem["G"] = np.ascontiguousarray(G, dtype=float)
+    if problem["Q"] is not None:
+        problem["Q"] = np.ascontiguousarray(problem["Q"], dtype=float)
+    problem["A"], problem["A_index"] = np.ascontiguousarray(A, dtype=float), A_index
+    problem["b"] = np.ascontiguousarray(b)
+
+
+def _first_state(problem: dict[str, Any], model: Linear, record: Record) -> None:
+    """Put the prior of x0: Gaussian, uniform in a box, or so wide that it says nothing where the box has no end."""
+    x0, nx = model.x0, model.nx
+    if isinstance(x0, Normal):
+        problem |= {"m0": np.array(x0.mean), "P0": np.array(x0.P), "half0": np.zeros(nx)}
+        return
+    assert isinstance(x0, Box)
+    finite = np.isfinite(x0.lo) & np.isfinite(x0.hi)
+    m0, half = np.array(x0.mean), np.where(finite, 0.5 * (x0.hi - x0.lo), 0.0)
+    P0 = np.zeros((nx, nx))
+    if not finite.all():
+        # Around a least-squares trajectory, a thousand times as wide as the data leave it.
+        known = np.zeros(nx + model.ny)
+        rows = residuals(model, record)
+        base = reference(rows, model, known)
+        wide = np.maximum(1e3 * base.column[:nx], 10.0 * np.abs(base.X[:nx]))
+        m0 = np.where(finite, m0, base.X[:nx])
+        P0 = np.diag(np.where(finite, 0.0, wide**2))
+    problem |= {"m0": np.ascontiguousarray(m0, dtype=float), "P0": P0, "half0": half}
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of one kind; see core/ep_entry.hpp."""
+
+    stage: NDArray[np.intp]
+    h: Array
+    y: Array
+    kind: NDArray[np.int8]
+    group: NDArray[np.int32]
+    R: Array
+    lo: Array
+    hi: Array
+    lost: Array
+    mix: Array
+    output: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, p: int, stage: NDArray[np.intp], h: Array, kind: Any, **more: Any) -> "_Rows":
+        """Fill in what a kind of row does not have."""
+        K = len(stage)
+        none = {"y": np.zeros(K), "group": np.full(K, -1), "R": np.zeros(K), "lo": np.zeros(K), "hi": np.zeros(K)}
+        none |= {"lost": np.zeros(K), "mix": np.zeros((K, p)), "output": np.full(K, -1)}
+        return cls(stage=stage, h=h, kind=np.broadcast_to(np.asarray(kind, dtype=np.int8), (K,)), **(none | more))
+
+
+def _outputs(model: Linear, record: Record, dt: Array, scale: Array, outliers: bool) -> list[_Rows]:
+    T, nx, ny = len(record), model.nx, model.ny
+    p = nx + ny
+    if uniform_part(model.e) is None:
+        return _gaussian_outputs(model, record, dt, scale)
+    C, seen = _every(model.C, record, dt), record.seen
+    y = np.where(seen, record.y, 0.0)
+    t, j = np.nonzero(seen)
+    R = np.zeros((T, ny))
+    part = gaussian_part(model.e)
+    if part is not None:
+        R = np.diagonal(_every(part.cov(), record, dt), axis1=1, axis2=2)
+    mix = np.zeros((len(t), p))
+    if model.F is not None:
+        F = _every(model.F, record, dt)
+        N = _eliminate(F, seen)
+        C, y = N @ C, np.einsum("tij,tj->ti", N @ F, y)
+        R = np.einsum("tij,tj->ti", N**2, R)
+        mix[:, nx:] = np.where(np.eye(ny)[j] > 0, 0.0, N[t, j] ** 2 / 3.0)
+    more: dict[str, Any] = {"lost": np.zeros(len(t))}
+    if model.loss is not None:
+        kind: Any = np.full(len(t), MAYBE_LOST)
+        more["lost"] = _lost(model, record, dt, t, j)
+    elif outliers:
+        kind = np.full(len(t), CONTAMINATED)
+    else:
+        kind = np.where((R[t, j] > 0) | mix.any(axis=1), UNIFORM_GAUSSIAN, UNIFORM)
+    return [_Rows.of(p, t + 1, C[t, j], kind, y=y[t, j], group=nx + j, R=np.array(R[t, j]), mix=mix, output=j, **more)]
+
+
+def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) -> list[_Rows]:
+    """Whiten the seen outputs of each row."""
+    nx, ny = model.nx, model.ny
+    p = nx + ny
+    part = gaussian_part(model.e)
+    assert part is not None
+    C, R = _every(model.C, record, dt), _every(part.cov(), record, dt)
+    y = np.where(record.seen, record.y, 0.0)
+    if model.F is not None:
+        inverse = np.linalg.inv(_every(model.F, record, dt))
+        C = inverse @ C
+        R = inverse @ R @ np.swapaxes(inverse, 1, 2)
+    found = []
+    patterns, which = np.unique(record.seen, axis=0, return_inverse=True)
+    for k, pattern in enumerate(patterns):
+        s = np.flatnonzero(pattern)
+        if not s.size:
+            continue
+        t = np.flatnonzero(which.ravel() == k)
+        part_R = np.array(R[t][:, s][:, :, s])
+        least = _EXACT * np.maximum(scale[nx + s] ** 2, np.abs(y[t][:, s]).max(axis=0) ** 2 * _EXACT)
+        part_R[:, np.arange(s.size), np.arange(s.size)] += np.where(
+            np.diagonal(part_R, axis1=1, axis2=2) <= least, least, 0.0
+        )
+        if model.loss is not None:  # a loss strikes one sensor: `refused` has seen to a diagonal R
+            for a, j in enumerate(s):
+                more = {"y": y[t, j], "R": part_R[:, a, a], "output": np.full(t.size, j)}
+                more["lost"] = _lost(model, record, dt, t, np.full(t.size, j))
+                found.append(_Rows.of(p, t + 1, C[t, j], MAYBE_LOST, **more))
+            continue
+        try:
+            L = np.linalg.cholesky(part_R)
+        except np.linalg.LinAlgError:
+            spread = np.einsum("tii->t", part_R)[:, None, None] * 1e-12
+            L = np.linalg.cholesky(part_R + spread * np.eye(s.size))
+        h = np.linalg.solve(L, C[t][:, s])
+        white = np.linalg.solve(L, y[t][:, s, None])[:, :, 0]
+        # the whitened row keeps the unit of its output, so that its density is the output's own
+        d = np.diagonal(L, axis1=1, axis2=2)
+        for a, j in enumerate(s):
+            found.append(
+                _Rows.of(
+                    p, t + 1, h[:, a] * d[:, a, None], GAUSSIAN, y=white[:, a] * d[:, a], R=d[:, a] ** 2,
+                    output=np.full(t.size, j),
+                )
+            )  # fmt: skip
+    return found
+
+
+def _lost(model: Linear, record: Record, dt: Array, t: NDArray[np.intp], j: NDArray[np.intp]) -> Array:
+    """Return the log density of each seen output if it was lost."""
+    R = _every(model.e.cov(), record, dt)
+    kind = model.loss.kind[0]
+    found = np.zeros(len(t))
+    center = np.broadcast_to(np.asarray(model.loss.center, dtype=float), (model.ny,))
+    for k, (a, b) in enumerate(zip(t.tolist(), j.tolist(), strict=True)):
+        v = float(model.loss.cov(kind, R[a])[b, b])
+        found[k] = -0.5 * (np.log(2 * np.pi * v) + (record.y[a, b] - center[b]) ** 2 / v)
+    return found
+
+
+def _bounds(model: Linear, T: int, scale: Array) -> list[_Rows]:
+    if model.bounds is None:
+        return []
+    D, lo, hi = model.bounds.rows
+    p = model.nx + model.ny
+    keep = np.isfinite(lo) | np.isfinite(hi)
+    D, lo, hi = D[keep], lo[keep], hi[keep]
+    found = []
+    for d, a, b in zip(D, lo, hi, strict=True):
+        stage, h = np.arange(1, T + 1), np.broadcast_to(d, (T, model.nx))
+        if a == b:  # an equality is an output without noise
+            unit = float(np.abs(d) @ scale[: model.nx])
+            R = np.full(T, _EXACT * max(unit, 1e-12 * abs(a), 1e-150) ** 2)
+            found.append(_Rows.of(p, stage, h, GAUSSIAN, y=np.full(T, a), R=R))
+        else:
+            found.append(_Rows.of(p, stage, h, TRUNCATION, lo=np.full(T, a), hi=np.full(T, b)))
+    return found
+
+
+def _first_bounds(model: Linear) -> list[_Rows]:
+    """One end of the box of x0 without the other is a bound of stage 0."""
+    if not isinstance(model.x0, Box):
+        return []
+    p, nx = model.nx + model.ny, model.nx
+    one = np.flatnonzero(np.isfinite(model.x0.lo) ^ np.isfinite(model.x0.hi))
+    if not one.size:
+        return []
+    stage = np.zeros(one.size, dtype=np.intp)
+    return [_Rows.of(p, stage, np.eye(nx)[one], TRUNCATION, lo=model.x0.lo[one], hi=model.x0.hi[one])]

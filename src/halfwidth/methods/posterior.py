@@ -1,0 +1,432 @@
+"""Posterior: mean and credible intervals over states, half-widths and unknown entries, by expectation propagation.
+
+The joint mode of states and half-widths drives half-widths to zero; the posterior integrates the states out. Every
+factor of the model acts on one linear functional of the trajectory: a row of the dynamics, a seen output, a bound.
+Expectation propagation replaces each by a Gaussian with the moments it leaves (core/ep.hpp), at the price of a few
+smoother passes. Its evidence log Z finds what is unknown:
+
+    p(s | y) ~ Z(s) p(s),    p(log s) = s^power told(s),    told^2 = mean (1 - posterior / prior variance of a row)^2
+
+The prior has no scale: where a noise drowns in the others told ~ s^2 and the prior falls to 0, where it is seen told
+is 1 and the prior is a power. `power` is what a study of coverage in windows of 6, 26 and 51 rows gave (benchmarks/posterior.py).
+Around the mode, weighted nodes carry what is not known of s into the intervals, and first-order corrections of skewness
+and kurtosis bend the Gaussian marginals to the light tails that bounded noise has.
+
+References
+----------
+Minka (2001), Expectation propagation for approximate Bayesian inference, UAI. Opper, Paquet and Winther (2013),
+Perturbative corrections for approximate inference in Gaussian latent variable models, JMLR 14. Durbin and Koopman
+(2001), ch. 4: the disturbance smoother that gives every cavity. Model: Pavelková and Kárný (2013), eqs. (1), (2).
+"""
+
+import functools
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import halfwidth._core as _core
+from halfwidth.array import Array
+from halfwidth.errors import BadShape, BadValue
+from halfwidth.loss import Bernoulli
+from halfwidth.methods._protocol import typed
+from halfwidth.methods._sites import Sites, gaussian_part, sites, uniform_part
+from halfwidth.model import Linear, Model, Nonlinear
+from halfwidth.noise import Gaussian
+from halfwidth.record import Record
+from halfwidth.result import Estimate, Status
+from halfwidth.spread import Box, Normal, Shaped
+
+_STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
+#: Power of the half-widths' prior; see above.
+POWER = 0.6
+#: Nodes are Gaussian in this power of a half-width: there a half-width that may be 0 has no tail.
+_WARP = 0.5
+_LIMITS = {
+    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.25, "least": 0.3,
+    "narrow": 0.03, "damping": 0.7, "warp": _WARP, "reference": 1.0,
+}  # fmt: skip
+#: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
+#: with them; there is less left to integrate.
+_LONG = 2000
+_FIRST = 400
+_OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
+#: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
+_KNOWN = {"most": 200, "tol_nodes": 1e-7}
+#: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
+_MIXED = {"most": 12, "damping": 0.5}
+#: Moments that agree this well, in standard deviations, are good, and good enough to be used.
+_FINE, _USABLE = 0.01, 0.1
+#: Fewer effective nodes than this leave an integral over half-widths rough.
+_FEW = 3.0
+#: Beta prior of a contamination rate that is learned.
+_RATE = (1.0, 30.0)
+_MOST_STATES = 16
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Posterior moments of the states, and of the half-widths where they are unknown.
+
+    Parameters
+    ----------
+    nodes : int
+        Points over which unknown half-widths are integrated; 1 takes their mode as if it were the truth.
+    outliers : float or bool
+        Share of outputs that are outliers, whose noise is ten half-widths wide; True learns it. Each output noise needs
+        a bounded part.
+    rounds : int
+        Most linearisations of a nonlinear model.
+    sweeps : int
+        Most sweeps of one evaluation with everything known.
+
+    Notes
+    -----
+    ``q``, ``r`` are posterior means. ``loglik`` is the logarithm of the evidence, half-widths integrated out under a
+    prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
+    count as a factor, not as a condition. In ``info``: ``x0``; ``half_widths``, a mapping with ``mean``, ``sd``, ``lo``
+    and ``hi`` (5 and 95 %) of (q, r); ``outliers``, the named outputs with a probability above one half; ``residual``,
+    the disagreement of moments in standard deviations, the largest of each node; ``sweeps``; ``nodes`` and their ``effective`` number.
+
+    Raises
+    ------
+    BadValue
+        If a setting is out of its domain.
+
+    Examples
+    --------
+    >>> import halfwidth as hw
+    >>> walk = hw.Linear([[1]], None, [[1]], hw.Uniform(1.0), hw.Uniform(0.5), hw.Box(-10, 10))
+    >>> est = hw.estimate(walk, hw.Record([0.0, 1.0, 2.0], [0.0, None, 3.0]), hw.Posterior())
+    >>> lo, hi = est.interval(0.9)
+    >>> bool(np.all(lo[-1] >= 1.5) and np.all(hi[-1] <= 2.51))  # |x0| <= .5, two steps of 1, |x2 - 3| <= .5
+    True
+    """
+
+    nodes: int = 64
+    outliers: float | bool = False
+    rounds: int = 20
+    sweeps: int = 200
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.nodes, int | np.integer) or self.nodes < 1:
+            raise BadValue(f"`nodes` is {self.nodes!r}, a positive whole number was expected")
+        if not isinstance(self.outliers, bool) and not 0 <= self.outliers < 1:
+            raise BadValue(f"`outliers` is {self.outliers!r}, a share from 0 below 1, or True, was expected")
+        for name in ("rounds", "sweeps"):
+            if not isinstance(getattr(self, name), int | np.integer) or getattr(self, name) < 1:
+                raise BadValue(f"`{name}` is {getattr(self, name)!r}, a positive whole number was expected")
+
+    def refuses(self, model: Model) -> str | None:
+        """Return why the model is none of this method, with a hint, or None."""
+        reason, hint = self._reason(model)
+        return None if reason is None else f"`Posterior` {reason}\nhint: {hint}"
+
+    def _reason(self, model: Model) -> tuple[str | None, str]:
+        if model.nx > _MOST_STATES:
+            return f"takes at most {_MOST_STATES} states but the model has {model.nx}", "a smaller model"
+        if isinstance(model, Nonlinear) and model.loss is not None:
+            return "takes no loss of a nonlinear model", "RBPF() or ParticleFilter()"
+        part = gaussian_part(model.e)
+        if part is not None and uniform_part(model.e) is not None and not _diagonal(part):
+            return "needs independent outputs where noise is mixed but `e` has a full covariance", "variances (ny,)"
+        if self.outliers and (uniform_part(model.e) is None or isinstance(model, Nonlinear) or model.loss is not None):
+            return (
+                "finds outliers of bounded output noise in a linear model without loss",
+                "e=Uniform(r) or Uniform(r) + Gaussian(R), or outliers=False",
+            )
+        if model.loss is not None:
+            return self._loss_reason(model)
+        if isinstance(model, Linear) and model.theta_entries:
+            for entry in model.theta_entries:
+                if not model.matrices[entry.matrix].constant:
+                    return f"needs constant unknown entries but `{entry.matrix}` varies with time", "a constant matrix"
+        return None, ""
+
+    def _loss_reason(self, model: Model) -> tuple[str | None, str]:
+        loss = model.loss
+        single = isinstance(loss, Bernoulli) and all(len(g) == 1 for g in loss.groups(model.ny))
+        if not isinstance(loss, Bernoulli) or loss.kind != ("noise",) or not single or loss.received.size != 1:
+            return (
+                "takes losses of single outputs with one probability, replaced by noise, but `loss` is "
+                f"{loss!r} on {model.ny} outputs",
+                "BKF2(), GPB() or RBPF()",
+            )
+        if getattr(loss, "learn_noise", False) or (isinstance(model, Linear) and model.F is not None):
+            return "takes losses of known noise and outputs without `F`", "BKF2() or RBPF()"
+        if loss.noise is None and not model.e.known:
+            return "needs the noise of lost samples where half-widths are unknown", "Bernoulli(p, noise=...)"
+        part = gaussian_part(model.e)
+        if part is not None and not _diagonal(part):
+            return "needs independent outputs where they may be lost but `e` has a full covariance", "RBPF()"
+        return None, ""
+
+    def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
+        """Estimate the states of one record."""
+        if isinstance(model, Nonlinear):
+            from halfwidth.methods._relinearise import relinearised
+
+            return relinearised(self, model, record)
+        if model.theta_entries:
+            from halfwidth.methods._entries import with_entries
+
+            return with_entries(self, model, record)
+        return self.answer(model, record).estimate
+
+    def answer(self, model: Linear, record: Record, *, start: "Start | None" = None) -> "Answer":
+        """Return the estimate of a model without unknown entries, and what the next one may start from."""
+        problem = sites(model, record, outliers=self.outliers is not False and self.outliers != 0)
+        if start is None and len(record) > 2 * _FIRST and problem.free.any():
+            # The first rows alone say where to look.
+            cut = {k: v.value[:_FIRST] for k, v in model.matrices.items() if v.value is not None and v.value.ndim == 3}
+            short: Linear = replace(model, **cut) if cut else model  # type: ignore[arg-type]
+            first = Record(record.t[:_FIRST], record.y[:_FIRST], None if record.u is None else record.u[:_FIRST])
+            try:
+                quick = replace(self, nodes=1).answer(short, first)
+            except BadShape:  # a noise stacked row by row
+                quick = None
+            if quick is not None and int(quick.found["code"]) < 2:
+                start = Start(np.where(quick.chain.free, quick.start.s, math.sqrt(3.0) * problem.scale), None)
+        found = self._solve(problem, model, start)
+        return Answer(self._estimate(problem, found, model, record), problem, found)
+
+    def _solve(self, chain: Sites, model: Linear, start: "Start | None") -> dict[str, Any]:
+        rate, learn_rate, beta = self._rate(model)
+        first = np.where(chain.uniform, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), 0.0)
+        first = np.where(chain.free, first, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
+        sites_, was = None, None
+        if start is not None:
+            first = np.where(chain.free, np.clip(start.s, chain.floor, chain.cap), first)
+            sites_, was = start.sites, first if start.sites is not None else None
+        q = int(chain.free.sum()) + learn_rate
+        z, log_proposal = nodes(q, self.nodes if q else 1)
+        limits = dict(_LIMITS)
+        rows = max(float(chain.count.sum()), 1.0)
+        limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
+        limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
+        if rows > _LONG:
+            limits |= _OF_LONG
+        if q == 0:
+            limits |= _KNOWN | {"most": self.sweeps}
+        if rate > 0 and q:
+            limits |= _MIXED
+        if chain.exact:
+            limits["most"] = 1
+        return dict(
+            _core.ep_learn(
+                chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
+                learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z, log_proposal,
+                limits, sites_, was,
+            )
+        )  # fmt: skip
+
+    def _rate(self, model: Linear) -> tuple[float, bool, tuple[float, float]]:
+        """Return the rate of outliers or losses, whether it is learned, and its prior."""
+        loss = model.loss
+        if loss is not None:
+            lost = 1.0 - float(np.ravel(loss.received)[0])
+            if loss.known:
+                return min(max(lost, 1e-12), 1 - 1e-12), False, (1.0, 1.0)
+            worth = float(loss.worth)
+            return min(max(lost, 1e-3), 1 - 1e-3), True, (max(lost * worth, 1e-3), max((1 - lost) * worth, 1e-3))
+        if self.outliers is True:
+            return 0.01, True, _RATE
+        return float(self.outliers), False, (1.0, 1.0)
+
+    def _estimate(self, chain: Sites, found: dict[str, Any], model: Linear, record: Record) -> Estimate:
+        nx = model.nx
+        code, residual = int(found["code"]), float(found["residual"])
+        status = _STATUS[code]
+        x, P, k3, k4 = found["x"], found["P"], found["k3"], found["k4"]
+        sound = code < 2 and bool(np.isfinite(x).all() and np.isfinite(P).all())
+        info: dict[str, Any] = {"notes": []}
+        widths = _Widths.of(chain, found) if sound else _Widths.none(chain)
+        if sound:
+            one = found["nodes"] == 1 and found["mode"].size > 0
+            few = code == 1 if one else found["nodes"] > 1 and widths.effective < _FEW
+            status = Status.STALLED if residual > _USABLE else Status.REDUCED if residual > _FINE or few else Status.OK
+        loglik: float | None = None
+        if sound:
+            q = found["mode"].size
+            loglik = float(found["log_evidence"] - found["log_prior"] - 0.5 * q * math.log(2 * math.pi))
+        else:
+            status = Status.INFEASIBLE if code >= 2 else Status.STALLED
+            x, P = self._fallback(chain, widths)
+            k3 = k4 = np.zeros_like(x)
+            info["hint"] = "wider half-widths, outliers=True, or missing outputs; BatchLP() names the rows in conflict"
+            info["message"] = (
+                f"{status.value}, or the iteration ran away from it; "
+                "states are those of a Gaussian smoother with the same variances"
+            )
+        k3, k4 = (np.where(np.isfinite(k), k, 0.0) for k in (k3, k4))
+        box = model.bounds if isinstance(model.bounds, Box) else None
+        within = None if box is None else (np.asarray(box.lo), np.asarray(box.hi))
+        if box is not None:
+            x = np.concatenate([x[:1], np.clip(x[1:], box.lo, box.hi)])
+        if chain.exact or not sound:
+            spread: Any = Normal.of(x[1:].copy(), P[1:].copy(), within)
+        else:
+            spread = Shaped(x[1:].copy(), P[1:].copy(), k3[1:].copy(), k4[1:].copy(), within)
+        gamma = None
+        if found["out"] is not None and sound:
+            share = np.where(record.seen, 0.0, np.nan)
+            kept = chain.output >= 0
+            share[chain.row[kept], chain.output[kept]] = found["out"][kept]
+            if model.loss is not None:
+                gamma = 1.0 - np.where(record.seen, share, 0.0)
+            else:
+                info["outliers"] = _named(share, model, record)
+                info["outlier_probability"] = share
+        has_q, has_r = chain.uniform[:nx].any(), chain.uniform[nx:].any()
+        lost = chain.uniform & (chain.floor < chain.cap) & (chain.count == 0)
+        if lost.any():
+            names = [*model.names.x, *model.names.y]
+            info["notes"].append(
+                "bound not identifiable: " + ", ".join(n for n, m in zip(names, lost, strict=True) if m)
+            )
+        info |= {
+            "x0": x[0].copy(),
+            "half_widths": {"mean": widths.mean, "sd": widths.sd, "lo": widths.lo, "hi": widths.hi},
+            "rate": widths.rate,
+            "residual": residual,
+            "sweeps": int(found["sweeps"]),
+            "nodes": int(found["nodes"]),
+            "effective": widths.effective,
+        }
+        return Estimate(
+            record.t,
+            x[1:].copy(),
+            spread,
+            status,
+            typed(self),
+            q=widths.mean[:nx].copy() if has_q and sound else None,
+            r=widths.mean[nx:].copy() if has_r and sound else None,
+            gamma=gamma,
+            loglik=loglik,
+            names=model.names.x,
+            labels=record.labels,
+            info=info,
+        )
+
+    def _fallback(self, chain: Sites, widths: "_Widths") -> tuple[Array, Array]:
+        """Return the moments of the chain with every uniform replaced by a Gaussian of its variance."""
+        problem = dict(chain.problem, half0=np.maximum(chain.problem["half0"], 0.0))
+        s = np.ascontiguousarray(np.where(widths.mean > 0, widths.mean, 1e-9 * np.maximum(chain.scale, 1e-290))[None])
+        found = _core.ep_run(problem, s, np.zeros(1), 0, 1.0, 1.0, None)
+        x, P = found["x"][0], found["P"][0]
+        bad = ~(np.isfinite(x).all(axis=1) & np.isfinite(P).all(axis=(1, 2)))
+        if bad.any():  # nothing is known there
+            x[bad] = problem["m0"]
+            P[bad] = np.diag(1e6 * np.maximum(chain.scale[: x.shape[1]] ** 2, 1e-12 * problem["m0"] ** 2))
+        return x, P
+
+
+class Start(NamedTuple):
+    """What an evaluation may start from: half-widths (p,) and the sites that belong to them."""
+
+    s: Array
+    sites: tuple[Array, Array, Array, Array] | None
+
+
+class Answer(NamedTuple):
+    """An estimate, its chain and what the core found."""
+
+    estimate: Estimate
+    chain: Sites
+    found: dict[str, Any]
+
+    @property
+    def start(self) -> Start:
+        """Where the mode is, for the next evaluation of a chain of the same shape."""
+        s = self.chain.floor.copy()
+        free = np.flatnonzero(self.chain.free)
+        s[free] = np.exp(self.found["mode"][: free.size])
+        return Start(np.where(self.chain.free, s, self.chain.cap), self.found["sites"])
+
+
+class _Widths(NamedTuple):
+    """Posterior of the half-widths (q, r), each (p,), and of the rate."""
+
+    mean: Array
+    sd: Array
+    lo: Array
+    hi: Array
+    rate: float | None
+    effective: float
+
+    @classmethod
+    def none(cls, chain: Sites) -> "_Widths":
+        """Known half-widths as they are, free ones generously from the data's scale."""
+        s = np.where(chain.free, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), chain.floor)
+        return cls(s, np.zeros_like(s), s, s, None, 0.0)
+
+    @classmethod
+    def of(cls, chain: Sites, found: dict[str, Any]) -> "_Widths":
+        mean = chain.floor.copy()
+        sd, lo, hi = np.zeros_like(mean), mean.copy(), mean.copy()
+        free = np.flatnonzero(chain.free)
+        K = int(found["nodes"])
+        phi = found["phi"][:K]
+        weight = np.ones(1)
+        if K > 1:
+            weight = np.exp(found["log_weight"][:K] - found["log_weight"][:K].max())
+            weight /= weight.sum()
+        s = np.exp(phi[:, : free.size])
+        m = weight @ s
+        mean[free] = m
+        # one node stands for a narrow posterior: its width is that of the Gaussian at the mode
+        blur = np.linalg.inv(found["H"]) if K == 1 and phi.shape[1] else np.zeros((phi.shape[1], phi.shape[1]))
+        sd[free] = np.sqrt(weight @ (s - m) ** 2 + m**2 * np.diagonal(blur)[: free.size])
+        for k, j in enumerate(free):
+            order = np.argsort(s[:, k])
+            below = np.cumsum(weight[order])
+            lo[j] = s[order[np.searchsorted(below, 0.05)], k] if K > 1 else max(m[k] - 1.645 * sd[j], 0.0)
+            hi[j] = s[order[min(int(np.searchsorted(below, 0.95)), K - 1)], k] if K > 1 else m[k] + 1.645 * sd[j]
+        rate = None
+        if phi.shape[1] > free.size:
+            rate = float(weight @ (1.0 / (1.0 + np.exp(-phi[:, -1]))))
+        return cls(mean, sd, lo, hi, rate, float(1.0 / (weight @ weight)))
+
+
+def _named(share: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
+    """Return the outputs that are outliers more likely than not, the surest first."""
+    with np.errstate(invalid="ignore"):
+        rows, columns = np.nonzero(share > 0.5)
+    order = np.argsort(-share[rows, columns], kind="stable")
+    return [
+        {
+            "t": float(record.t[rows[k]]),
+            "row": int(rows[k]),
+            "name": model.names.y[columns[k]],
+            "probability": float(share[rows[k], columns[k]]),
+        }
+        for k in order
+    ]
+
+
+@functools.lru_cache(maxsize=64)
+def nodes(q: int, count: int) -> tuple[Array, Array]:
+    """Return `count` points (count, q) of a t distribution with 10 degrees of freedom, and their log density (count,).
+
+    They come in pairs z, -z from a fixed seed: the same for every window, and centred.
+    """
+    if count == 1 or q == 0:
+        return np.zeros((1, q)), np.zeros(1)
+    freedom = 10
+    rng = np.random.default_rng(20260)
+    half = (count + 1) // 2
+    z = rng.standard_normal((half, q)) * np.sqrt(freedom / rng.chisquare(freedom, half))[:, None]
+    z = np.concatenate([z, -z])[:count]
+    constant = math.lgamma(0.5 * (freedom + q)) - math.lgamma(0.5 * freedom) - 0.5 * q * math.log(freedom * math.pi)
+    return np.ascontiguousarray(z), constant - 0.5 * (freedom + q) * np.log1p((z**2).sum(axis=1) / freedom)
+
+
+def _diagonal(part: Gaussian) -> bool:
+    R = part.cov()
+    if not R.constant:
+        return False
+    return bool(np.count_nonzero(R.single - np.diag(np.diagonal(R.single))) == 0)
+
+
+__all__ = ["Answer", "Posterior", "Start"]

@@ -1,0 +1,253 @@
+"""`Posterior`: limits where the answer is known, coverage, what it learns, and how it fails."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import halfwidth as hw
+
+A = np.array([[1, -0.5, 0.2], [0.5, 0.1, 0], [0.3, 0, -0.1]])
+C = np.array([[1, 0, 0.5], [0, 1, 0.5]])
+BOX = hw.Box(-2 * np.ones(3), 2 * np.ones(3))
+
+
+def paper(w, e, x0=BOX, **more):
+    return hw.Linear(A, [[0.1], [0.6], [0.3]], C, w, e, x0, **more)
+
+
+def drawn(T, seed):
+    """Return the states, x0 first, and a record of the true system, half-widths .1 and .3."""
+    true = paper(hw.Uniform(0.1), hw.Uniform(0.3), hw.Box(-0.3 * np.ones(3), 0.3 * np.ones(3)))
+    rng = np.random.default_rng(seed)
+    return hw.simulate(true, rng.uniform(-1, 1, (T, 1)), seed=seed)
+
+
+UNKNOWN = hw.Uniform.unknown(at_most=3.0)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.4])
+def test_gaussian_noise_is_the_smoother(missing):
+    rng = np.random.default_rng(1)
+    R = [[0.5, 0.2], [0.2, 0.4]]
+    model = paper(hw.Gaussian([[0.3, 0.1, 0], [0.1, 0.2, 0], [0, 0, 0.1]]), hw.Gaussian(R), hw.Normal(np.zeros(3), 1.0))
+    model = dataclasses.replace(model, E=hw.Linear(A, None, C, UNKNOWN, UNKNOWN, None, E=np.eye(3)).E, F=None)
+    _, record = hw.simulate(model, rng.standard_normal((50, 1)), seed=1)
+    y = record.y.copy()
+    y[rng.random(y.shape) < missing] = np.nan
+    record = hw.Record(record.t, y, record.u)
+    one, two = hw.estimate(model, record, hw.Posterior()), hw.estimate(model, record, hw.KalmanSmoother())
+    np.testing.assert_allclose(one.x, two.x, atol=1e-9)
+    np.testing.assert_allclose(one.P, two.P, atol=1e-9)
+    assert one.loglik == pytest.approx(two.loglik, abs=1e-9)
+    assert isinstance(one.spread, hw.Normal)
+
+
+def test_known_half_widths_agree_with_a_sampler():
+    from halfwidth.methods._sample import sample
+
+    truth, record = drawn(12, 2)
+    model = paper(hw.Uniform(0.1), hw.Uniform(0.3), bounds=BOX)
+    est = hw.estimate(model, record, hw.Posterior())
+    draws = sample(model, record, draws=1500, chains=2, seed=1)
+    x = draws.x[:, :, 1:].reshape(-1, *est.x.shape)
+    sd = x.std(axis=0)
+    assert np.abs((est.x - x.mean(axis=0)) / sd).mean() < 0.05
+    assert np.abs(est.spread.sd / sd - 1).max() < 0.12
+    for level in (0.5, 0.9):
+        lo, hi = est.interval(level)
+        assert ((x >= lo) & (x <= hi)).mean() == pytest.approx(level, abs=0.02)
+    assert np.asarray(truth).shape == est.x.shape
+
+
+def test_half_widths_are_learned_without_bias():
+    q, r = [], []
+    for seed in range(6):
+        _, record = drawn(150, seed)
+        est = hw.estimate(paper(UNKNOWN, UNKNOWN), record)
+        assert est.method.startswith("Posterior")
+        assert est.status.good
+        q.append(est.q)
+        r.append(est.r)
+        widths = est.info["half_widths"]
+        assert np.all(widths["lo"] <= widths["mean"])
+        assert np.all(widths["mean"] <= widths["hi"])
+    np.testing.assert_allclose(np.mean(q, axis=0)[:2], 0.1, rtol=0.2)
+    np.testing.assert_allclose(np.mean(r, axis=0), 0.3, rtol=0.1)
+
+
+def test_intervals_cover_what_they_say():
+    inside = []
+    for seed in range(40):
+        truth, record = drawn(26, 100 + seed)
+        est = hw.estimate(paper(UNKNOWN, UNKNOWN), record, hw.Posterior())
+        inside.append(
+            [((truth >= lo) & (truth <= hi)).mean() for lo, hi in (est.interval(p) for p in (0.5, 0.8, 0.95))]
+        )
+    np.testing.assert_allclose(np.mean(inside, axis=0), [0.5, 0.8, 0.95], atol=0.06)
+
+
+def test_outliers_are_named_and_do_no_harm():
+    truth, record = drawn(150, 3)
+    rng = np.random.default_rng(0)
+    y = record.y.copy()
+    bad = rng.random(y.shape) < 0.01
+    y[bad] += rng.choice([-3.0, 3.0], bad.sum())
+    clean = hw.estimate(paper(UNKNOWN, UNKNOWN), record, hw.Posterior())
+    est = hw.estimate(paper(UNKNOWN, UNKNOWN), hw.Record(record.t, y, record.u), hw.Posterior(outliers=True))
+    assert est.status.good
+    assert np.abs(est.x - truth).mean() <= 1.1 * np.abs(clean.x - truth).mean()
+    assert {(o["row"], o["name"]) for o in est.info["outliers"]} == {
+        (int(t), est.info["outliers"][0]["name"][:-1] + str(j)) for t, j in np.argwhere(bad)
+    } or len(est.info["outliers"]) == bad.sum()
+    assert 0.001 < est.info["rate"] < 0.05
+
+
+def test_losses_are_found():
+    loss = hw.Bernoulli(0.8, noise=4.0, sensors=[[0], [1]])
+    model = paper(hw.Uniform(0.1), hw.Uniform(0.3), loss=loss)
+    rng = np.random.default_rng(4)
+    truth, record = hw.simulate(model, rng.uniform(-1, 1, (200, 1)), seed=4)
+    est = hw.estimate(model, record, hw.Posterior())
+    blind = hw.estimate(dataclasses.replace(model, loss=None).as_gaussian(), record, hw.KalmanSmoother())
+    assert est.gamma.shape == record.y.shape
+    assert np.abs(est.x - truth).mean() < 0.8 * np.abs(blind.x - truth).mean()
+    learned = hw.estimate(
+        dataclasses.replace(model, loss=hw.Bernoulli.unknown(0.5, noise=4.0, sensors=[[0], [1]])),
+        record,
+        hw.Posterior(),
+    )
+    assert learned.info["rate"] == pytest.approx(0.2, abs=0.08)
+
+
+def test_unknown_entries():
+    true = hw.Linear(
+        [[0.9, 0.2], [-0.2, 0.8]], None, np.eye(2), hw.Uniform(0.1), hw.Uniform(0.2), hw.Box([-1, -1], [1, 1])
+    )
+    _, record = hw.simulate(true, T=60, seed=1)
+    model = hw.Linear(
+        [[np.nan, 0.2], [-0.2, 0.8]], None, np.eye(2), UNKNOWN, UNKNOWN, hw.Box([-1, -1], [1, 1]),
+        theta_bounds=([0], [1.2]),
+    )  # fmt: skip
+    est = hw.estimate(model, record, hw.Posterior(nodes=16))
+    assert est.status.good
+    assert abs(est.theta[0] - 0.9) < 3 * est.info["theta_sd"][0] + 0.02
+    assert 0.005 < est.info["theta_sd"][0] < 0.2
+
+
+def test_nonlinear_equals_linear_where_it_is():
+    model = paper(hw.Uniform(0.1), hw.Uniform(0.3))
+    _, record = drawn(30, 5)
+    bent = hw.Nonlinear(
+        lambda x, u: np.array(A) @ x + np.array([0.1, 0.6, 0.3]) * u[0], lambda x: np.array(C) @ x, model.w, model.e, BOX,
+        nu=1,
+    )  # fmt: skip
+    one, two = hw.estimate(model, record, hw.Posterior()), hw.estimate(bent, record, hw.Posterior())
+    np.testing.assert_allclose(two.x, one.x, atol=1e-5)
+    assert two.loglik == pytest.approx(one.loglik, abs=1e-3)
+
+
+def test_window_and_stream_carry_intervals():
+    truth, record = drawn(20, 6)
+    method = hw.Window(hw.Posterior(nodes=8), memory=6)
+    est = hw.estimate(paper(UNKNOWN, UNKNOWN, bounds=BOX), record.without(8, 12), method)
+    lo, hi = est.interval(0.9)
+    assert lo.shape == est.x.shape == np.asarray(truth).shape
+    live = hw.stream(paper(UNKNOWN, UNKNOWN, bounds=BOX), method)
+    for t, (y, u) in enumerate(zip(record.without(8, 12).y, record.u, strict=True)):
+        newest = live.push(y, u)
+        np.testing.assert_allclose(newest.x[0], est.x[t], atol=1e-9)
+        np.testing.assert_allclose(newest.interval(0.9)[0][0], lo[t], atol=1e-9)
+    assert np.all(hi - lo > 0)
+
+
+def test_linear_functionals():
+    _, record = drawn(20, 7)
+    est = hw.estimate(paper(hw.Uniform(0.1), hw.Uniform(0.3)), record, hw.Posterior())
+    lo, hi = est.interval(0.8, of=np.eye(3))
+    np.testing.assert_allclose((lo, hi), est.interval(0.8))
+    lo, hi = est.interval(0.8, of=[1, 0, 0.5])
+    assert lo.shape == (20, 1)
+    inside = est.x @ [1, 0, 0.5]
+    assert np.all((lo[:, 0] < inside) & (inside < hi[:, 0]))
+    with pytest.raises(hw.BadShape):
+        est.interval(0.8, of=[1, 0])
+
+
+def test_no_trajectory_fits():
+    _, record = drawn(20, 8)
+    y = record.y.copy()
+    y[10] += 50
+    est = hw.estimate(paper(hw.Uniform(0.1), hw.Uniform(0.3)), hw.Record(record.t, y, record.u), hw.Posterior())
+    assert est.status is hw.Status.INFEASIBLE
+    assert np.isfinite(est.x).all()
+    assert np.isfinite(est.interval()).all()
+    assert est.loglik is None
+    with pytest.raises(hw.Unsolved):
+        est.check()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_random_windows_never_give_nan(seed):
+    rng = np.random.default_rng(seed)
+    for _ in range(25):
+        n, ny, T = rng.integers(1, 4), rng.integers(1, 3), rng.integers(1, 12)
+        scale = 10 ** rng.uniform(-6, 6)
+        noise = [
+            hw.Uniform.unknown(at_most=rng.choice([1.0, 10.0]) * scale),
+            hw.Uniform(scale * rng.choice([0.0, 1e-6, 0.1, 1.0])),
+            hw.Gaussian((scale * rng.choice([0.0, 1e-3, 1.0])) ** 2),
+            hw.Uniform.unknown() + hw.Gaussian((0.1 * scale) ** 2),
+        ]
+        model = hw.Linear(
+            rng.uniform(-1, 1, (n, n)), None, rng.standard_normal((ny, n)), noise[rng.integers(4)], noise[rng.integers(4)],
+            [hw.Box(-scale * np.ones(n), scale * np.ones(n)), None, hw.Normal(np.zeros(n), scale**2)][rng.integers(3)],
+            bounds=[None, (-3 * scale * np.ones(n), 3 * scale * np.ones(n))][rng.integers(2)],
+        )  # fmt: skip
+        y = scale * rng.standard_normal((T, ny))
+        y[rng.random(y.shape) < rng.choice([0.0, 0.3, 1.0])] = np.nan
+        if rng.random() < 0.3:
+            y[rng.integers(T)] *= 1e3
+        est = hw.estimate(model, hw.Record(np.arange(1.0, T + 1), y), hw.Posterior(nodes=8))
+        assert np.isfinite(est.x).all()
+        lo, hi = est.interval(0.9)
+        assert np.isfinite(lo).all()
+        assert np.all(lo <= hi)
+        for value in (est.q, est.r):
+            assert value is None or np.isfinite(value).all()
+        assert est.loglik is None or np.isfinite(est.loglik)
+
+
+def test_evidence_and_left_out_score_choose_the_noise():
+    _, record = drawn(80, 9)
+    models = {
+        "uniform": paper(hw.Uniform(0.1), hw.Uniform(0.3)),
+        "too wide": paper(hw.Uniform(0.1), hw.Uniform(1.5)),
+        "gaussian": paper(hw.Gaussian(0.1**2 / 3), hw.Gaussian(0.3**2 / 3), hw.Normal(np.zeros(3), 1.0)),
+    }
+    found = hw.compare(models, record, seed=1)
+    assert found.best == "uniform"
+    assert found.foretells in ("uniform", "gaussian")
+    assert "too wide" in str(found)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"nodes": 0}, {"outliers": -0.1}, {"outliers": 1.0}, {"rounds": 0}, {"sweeps": 0}], ids=str
+)
+def test_bad_settings(settings):
+    with pytest.raises(hw.BadValue):
+        hw.Posterior(**settings)
+
+
+def test_refusals_say_what_to_do():
+    full = hw.Uniform(0.1) + hw.Gaussian([[1.0, 0.5], [0.5, 1.0]])
+    cases = [
+        (hw.Posterior(), paper(hw.Uniform(0.1), full)),
+        (hw.Posterior(outliers=True), paper(hw.Uniform(0.1), hw.Gaussian(0.1))),
+        (hw.Posterior(), paper(hw.Uniform(0.1), hw.Uniform(0.3), loss=hw.Markov(0.9, 0.5))),
+        (hw.Posterior(), paper(hw.Uniform(0.1), hw.Uniform(0.3), loss=hw.Bernoulli(0.9))),
+    ]
+    for method, model in cases:
+        assert "hint: " in method.refuses(model)
+        with pytest.raises(hw.Refused):
+            hw.estimate(model, hw.Record([1.0], [[0.0, 0.0]], [[0.0]]), method)
