@@ -81,9 +81,9 @@ if TYPE_CHECKING:
     from halfwidth.loss import Markov as Markov
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
-    from halfwidth.methods.constrain import Constrained as Constrained
     from halfwidth.methods.choose import Comparison as Comparison
     from halfwidth.methods.choose import compare as compare
+    from halfwidth.methods.constrain import Constrained as Constrained
     from halfwidth.methods.kalman import KalmanFilter as KalmanFilter
     from halfwidth.methods.kalman import KalmanSmoother as KalmanSmoother
     from halfwidth.methods.loss import BKF1 as BKF1
