@@ -73,7 +73,7 @@ def told_the_truth(record, *, correlated):
 
 def one_case(delta, *, correlated=False, missing=0.0, count=WINDOWS, seed=7, method=None):
     """Return filter and mid-window errors over those of the Kalman filter, coverage and learned half-widths."""
-    X, record, found = windows(delta, count, seed, correlated=correlated, missing=missing)
+    _, record, found = windows(delta, count, seed, correlated=correlated, missing=missing)
     kf = told_the_truth(record, correlated=correlated)
     unknown = hw.Uniform.unknown(at_most=1.0)
     model = system(unknown, unknown, correlated=correlated)

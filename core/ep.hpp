@@ -208,7 +208,7 @@ struct Ep {
             s.nu[k] = V(0.0);
             if (kind(k) == noise_gaussian) {
                 s.tau[k] = V(1.0 / a.R[k]);
-            } else if (kind(k) == ep_truncation) {
+            } else if (kind(k) >= noise_contaminated) {  // bounds, and rows that may say nothing: not until they are asked
                 s.tau[k] = V(0.0);
             } else {
                 const V w = a.group[k] >= 0 ? s.s[a.group[k]] : V(0.0);
@@ -301,11 +301,12 @@ struct Ep {
     }
 
     static inline void note(EpFound& f, const V& mean, const V& var, const Tilted4& t, const V& mu, const V& c) {
-        // a site never widens a belief: a factor that would is asked for its mean only
-        const V tv = larger(smaller(of(t.var), c), V(1e-300)), off = of(t.mean) - mu;
+        // a factor that would widen the belief has an empty site: nothing to agree on
+        const V tv = larger(of(t.var), V(1e-300)), off = of(t.mean) - mu;
         f.far = larger(f.far, off * off / larger(c, V(1e-300)));
         const V d = of(t.mean) - mean, e = magnitude(tv - var) / tv;
-        f.residual = larger(f.residual, larger(of(sqrt4((d * d / tv).v)), e));
+        const V gap = larger(of(sqrt4((d * d / tv).v)), e);
+        f.residual = larger(f.residual, of(tv.v >= c.v * (1.0 - 1e-9) ? V4{} : gap.v));
     }
 
     // renew (or, for the evidence, look at) the rows of stage t, given the belief ms, Ps about x_t
@@ -340,9 +341,8 @@ struct Ep {
                 const V tv = larger(of(q.var), V(1e-300));
                 V tau = V(1.0) / tv - V(1.0) / larger(c, V(1e-300));
                 V nu = of(q.mean) / tv - mu / larger(c, V(1e-300));
-                const V d = of(q.mean) - mu;
-                const auto wide = tau.v <= V4{};  // the factor widens the belief: keep its mean only
-                nu = of(wide ? (d / larger(c, V(1e-300))).v : nu.v);
+                const auto wide = tau.v <= V4{};  // the factor widens the belief: it says nothing for now
+                nu = of(wide ? V4{} : nu.v);
                 tau = of(wide ? V4{} : tau.v);
                 const double step = kind(k) >= noise_contaminated && kind(k) != ep_truncation ? damping : 1.0;
                 const V dt = V(step) * (tau - s.tau[k]), dn = V(step) * (nu - s.nu[k]);

@@ -300,6 +300,10 @@ class Both:
         size = np.where(inside, sd * biased_quantile(ratio, level), far)
         return self.mean - size, self.mean + size
 
+    def through(self, D: Array) -> "Both":
+        """Return what is known of ``D x``: the bounded parts add up in the worst way."""
+        return Both(self.mean @ D.T, D @ self.P @ D.T, self.half @ np.abs(D).T)
+
     def plain(self, kappa: float = 3.0) -> tuple[Array, Array]:
         """Return mean minus and plus ``half + kappa * sd``, the interval of Hanebeck, Horn and Schmidt."""
         size = self.half + kappa * self.sd

@@ -265,8 +265,8 @@ def first_scales(model: Linear, seen: Sequence[Array]) -> Array:
     for _ in range(50):
         gram += keep * (H @ step).T @ (H @ step)
         step, keep = Phi @ step / growth, 0.9 * keep
-    seen = gram.diagonal() > 0
-    sigma[:nx][seen] = 1.0 / np.sqrt(gram.diagonal()[seen])
+    felt = gram.diagonal() > 0
+    sigma[:nx][felt] = 1.0 / np.sqrt(gram.diagonal()[felt])
     return sigma
 
 

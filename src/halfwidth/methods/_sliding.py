@@ -356,8 +356,8 @@ def stacked(spreads: list[Spread | None]) -> Spread | None:
         return Box(lo, hi, guaranteed=all(s is not None and s.guaranteed for s in spreads))
     if all(isinstance(s, Normal | Shaped) for s in spreads):
         bent = [s if isinstance(s, Shaped) else _unbent(s) for s in spreads]
-        columns = [np.concatenate([getattr(s, f) for s in bent]) for f in ("mean", "P", "skew", "kurt")]
-        return Shaped(*columns, bent[-1].within)
+        mean, P, skew, kurt = (np.concatenate([getattr(s, f) for s in bent]) for f in ("mean", "P", "skew", "kurt"))
+        return Shaped(mean, P, skew, kurt, bent[-1].within)
     if isinstance(first, Both) and all(isinstance(s, Both) for s in spreads):
         return Both(*(np.concatenate([getattr(s, f) for s in spreads]) for f in ("mean", "P", "half")))
     if isinstance(first, Cloud) and all(isinstance(s, Cloud) for s in spreads):

@@ -91,7 +91,8 @@ def compare(
     >>> box = hw.Uniform.unknown(at_most=10.0)
     >>> still = hw.Linear([[1]], None, [[1]], hw.Uniform(0.0), box, hw.Box(-5, 5))
     >>> moving = hw.Linear([[1]], None, [[1]], box, box, hw.Box(-5, 5))
-    >>> _, record = hw.simulate(hw.Linear([[1]], None, [[1]], hw.Uniform(1), hw.Uniform(0.2), hw.Box(0, 0)), T=40, seed=1)
+    >>> true = hw.Linear([[1]], None, [[1]], hw.Uniform(1), hw.Uniform(0.2), hw.Box(0, 0))
+    >>> _, record = hw.simulate(true, T=40, seed=1)
     >>> hw.compare({"still": still, "moving": moving}, record, seed=1).best
     'moving'
     """

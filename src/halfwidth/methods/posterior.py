@@ -8,7 +8,8 @@ smoother passes. Its evidence log Z finds what is unknown:
     p(s | y) ~ Z(s) p(s),    p(log s) = s^power told(s),    told^2 = mean (1 - posterior / prior variance of a row)^2
 
 The prior has no scale: where a noise drowns in the others told ~ s^2 and the prior falls to 0, where it is seen told
-is 1 and the prior is a power. `power` is what a study of coverage in windows of 6, 26 and 51 rows gave (benchmarks/posterior.py).
+is 1 and the prior is a power. `power` is what a study of coverage gave in windows of 6, 26 and 51
+rows (benchmarks/posterior.py).
 Around the mode, weighted nodes carry what is not known of s into the intervals, and first-order corrections of skewness
 and kurtosis bend the Gaussian marginals to the light tails that bounded noise has.
 
@@ -87,7 +88,8 @@ class Posterior:
     prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
     count as a factor, not as a condition. In ``info``: ``x0``; ``half_widths``, a mapping with ``mean``, ``sd``, ``lo``
     and ``hi`` (5 and 95 %) of (q, r); ``outliers``, the named outputs with a probability above one half; ``residual``,
-    the disagreement of moments in standard deviations, the largest of each node; ``sweeps``; ``nodes`` and their ``effective`` number.
+    the disagreement of moments in standard deviations, the largest of each node; ``sweeps``; ``nodes`` and their
+    ``effective`` number.
 
     Raises
     ------
@@ -269,7 +271,9 @@ class Posterior:
         else:
             spread = Shaped(x[1:].copy(), P[1:].copy(), k3[1:].copy(), k4[1:].copy(), within)
         gamma = None
-        if found["out"] is not None and sound:
+        if found["out"] is not None and not sound and model.loss is None:
+            info |= {"outliers": [], "outlier_probability": np.where(record.seen, 0.0, np.nan)}
+        elif found["out"] is not None:
             share = np.where(record.seen, 0.0, np.nan)
             kept = chain.output >= 0
             share[chain.row[kept], chain.output[kept]] = found["out"][kept]
