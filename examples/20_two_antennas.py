@@ -11,7 +11,7 @@ import halfwidth as hw
 def main():
     # a car with two antennas 1.2 m apart, fixes of centimetres, and one tunnel of 25 s
     truth, log = hw.vehicle.simulate_drive(
-        duration=90.0, seed=6, tunnels=[25.0], fix_noise=0.02, fix_offset=0.05, second=(0.0, 1.2)
+        duration=70.0, seed=6, tunnels=[25.0], fix_noise=0.02, fix_offset=0.05, second=(0.0, 1.2)
     )
     line = np.c_[truth.lon_deg, truth.lat_deg][::10].tolist()
     road = {"type": "Feature", "properties": {"width": 3.0}, "geometry": {"type": "LineString", "coordinates": line}}
@@ -21,15 +21,14 @@ def main():
     for words, given in (
         ("one antenna", {"method": "paper002"}),
         ("two antennas", {"second": truth.second}),
-        ("on the map", {"second": truth.second, "roads": "roads.geojson"}),
-        ("within limits", {"second": truth.second, "limits": limits}),
+        ("map and limits", {"roads": "roads.geojson", "limits": limits}),
         ("in 3D", {"method": "paper002-3d"}),
     ):
         track = hw.vehicle.fill(log, **given)
         inside = track.quality == "bridged"
         east, north = truth.error_m(track.t_s[inside], track.lat_deg[inside], track.lon_deg[inside])
         off = np.hypot(east, north)
-        print(f"{words:14s}{track.method:12s} mean {off.mean():.2f} m, largest {off.max():.2f} m in the tunnel")
+        print(f"{words:15s}{track.method:12s} mean {off.mean():.2f} m, largest {off.max():.2f} m in the tunnel")
     print(next(message for message in track.messages if "floor" in message))
 
     # the same on line: the newest state from a window of rows

@@ -67,7 +67,7 @@ def test_height_and_acceleration_extend_them():
         np.full(8, 0.1), np.full(6, 0.1), x0=hw.Box(-1, 1), antennas=1, height=True, acceleration=True
     )
     x, h = np.array([0.0, 0, 0, 10, 0, 200, 0.1, 2]), 0.5
-    way = 5 + 0.25
+    way = 5
     np.testing.assert_allclose(car.move(x, None, h), [0, way * np.cos(0.1), 0, 11, 0, 200 + way * np.sin(0.1), 0.1, 2])
     assert car.names.y == ("east", "north", "azimuth", "speed", "yaw_rate", "altitude")
 

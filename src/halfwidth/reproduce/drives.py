@@ -7,7 +7,6 @@ import numpy as np
 from halfwidth.array import Array
 from halfwidth.reproduce import Table
 from halfwidth.vehicle import outages, read
-from halfwidth.vehicle.align import calibrated
 
 #: The tolerance of Pavelková's slides, m.
 TOLERANCE = 0.5
@@ -23,13 +22,11 @@ def tolerance_row(name: str, errors: Array) -> tuple[object, ...]:
 def log_table(path: str, methods: Sequence[str], *, quick: bool = False) -> Table:
     """Return the error of methods against the length of outages hidden in a log: mean / mean of maxima, m.
 
-    The clock offset of speed and yaw rate is found from the log first.
+    Clocks of speed and yaw rate are found from the log, as `outages` does.
     """
     lengths: tuple[float, ...] = (5.0, 30.0) if quick else (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
     log = read(path)
-    offset = calibrated(log).offsets.get("speed")
-    clock = offset.seconds if offset is not None and offset.observable else 0.0
-    found = outages(log, lengths, 3 if quick else 20, methods=list(methods), clock_offset=clock)
+    found = outages(log, lengths, 3 if quick else 20, methods=list(methods))
     rows = []
     for name in found.methods:
         cells = [next((c for c in found.cells if c.method == name and c.length == L), None) for L in found.lengths]
@@ -38,5 +35,4 @@ def log_table(path: str, methods: Sequence[str], *, quick: bool = False) -> Tabl
         f"Error against the length of the outage, {log.source.rpartition('/')[2]}: mean / mean of maxima, m",
         ("method", *(f"{L:g} s" for L in found.lengths)),
         tuple(rows),
-        (f"Clock of speed and yaw rate moved by {clock:+.2f} s, as the log itself tells.",),
     )

@@ -166,7 +166,8 @@ def two_antenna(
         Two further states, altitude (m) and pitch (rad, nose up): the vehicle climbs by ``sin pitch`` of the way it
         goes and moves across the map by ``cos pitch`` of it. A further output, the last: the altitude.
     acceleration : bool
-        A further state, the last: acceleration (m/s^2), which the speed follows.
+        A further state, the last: acceleration (m/s^2), which the speed follows from one step to the next; the speed
+        is that of the whole step that follows.
     bounds : Box, optional
         Restrictions on the states.
 
@@ -182,7 +183,7 @@ def two_antenna(
 
     def g(x: Any, u: Any, dt: Any) -> Any:  # noqa: ARG001 - the signature of a model
         azimuth = x[a] if euler else x[a] - 0.5 * dt * x[a + 2]
-        way = dt * x[a + 1] + (0.5 * dt * dt * x[n] if acceleration else 0.0)
+        way = dt * x[a + 1]
         flat = way * np.cos(x[a + 4]) if height else way
         moved = [x[k] + flat * (np.cos(azimuth) if k % 2 else np.sin(azimuth)) for k in range(a)]
         if rigid and antennas == 2:
