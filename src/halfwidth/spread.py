@@ -434,6 +434,21 @@ class Cloud:
         return ends[0], ends[1]
 
 
+def part(spread: Spread | None, rows: slice) -> Spread | None:
+    """Return the spread of some rows of an answer."""
+    if isinstance(spread, Box):
+        return Box(spread.lo[rows], spread.hi[rows], guaranteed=spread.guaranteed)
+    if isinstance(spread, Normal):
+        return Normal.of(spread.mean[rows], spread.P[rows], spread._within)
+    if isinstance(spread, Shaped):
+        return Shaped(spread.mean[rows], spread.P[rows], spread.skew[rows], spread.kurt[rows], spread.within)
+    if isinstance(spread, Both):
+        return Both(spread.mean[rows], spread.P[rows], spread.half[rows])
+    if isinstance(spread, Cloud):
+        return Cloud(spread.points[rows], spread.weights[rows])
+    return None
+
+
 def _level(level: float) -> float:
     if not 0.0 < level < 1.0:
         raise BadValue(f"`level` is {level!r}, a number between 0 and 1 was expected", hint="level=0.9")

@@ -40,6 +40,7 @@ from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.solvers.banded import Start, chain_of, solve
 from halfwidth.spread import Both, Box, Cloud, Normal, Shaped, Spread
+from halfwidth.spread import part as rows_of_spread
 
 if TYPE_CHECKING:
     from halfwidth.methods.window import Window
@@ -216,7 +217,7 @@ class Sliding:
         info = {k: v for k, v in est.info.items() if k in ("solver", "objective", "notes", "message", "gap")}
         return Solved(
             np.vstack([est.info.get("x0", self.x[a]), est.x]), np.zeros(0) if est.theta is None else est.theta, s,
-            est.status, int(est.info.get("iterations", 0) or 0), info, newest(est.spread),
+            est.status, int(est.info.get("iterations", 0) or 0), info, rows_of_spread(est.spread, slice(-1, None)),
         )  # fmt: skip
 
     def _costs(self, model: Model, part: Record) -> Array:
@@ -331,21 +332,6 @@ class Sliding:
         if saved["last"] is not None:
             theta, s, status = saved["last"]
             self.last = Solved(np.array(self.x), np.array(theta, dtype=float), arrays([s])[0], Status[status], 0, {})
-
-
-def newest(spread: Spread | None) -> Spread | None:
-    """Return what is known of the last row alone."""
-    if isinstance(spread, Box):
-        return Box(spread.lo[-1:], spread.hi[-1:], guaranteed=spread.guaranteed)
-    if isinstance(spread, Normal):
-        return Normal.of(spread.mean[-1:], spread.P[-1:], spread._within)
-    if isinstance(spread, Shaped):
-        return Shaped(spread.mean[-1:], spread.P[-1:], spread.skew[-1:], spread.kurt[-1:], spread.within)
-    if isinstance(spread, Both):
-        return Both(spread.mean[-1:], spread.P[-1:], spread.half[-1:])
-    if isinstance(spread, Cloud):
-        return Cloud(spread.points[-1:], spread.weights[-1:])
-    return None
 
 
 def stacked(spreads: list[Spread | None]) -> Spread | None:
