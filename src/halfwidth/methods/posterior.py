@@ -23,7 +23,7 @@ Perturbative corrections for approximate inference in Gaussian latent variable m
 import functools
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -81,9 +81,18 @@ class Posterior:
         Most linearisations of a nonlinear model.
     sweeps : int
         Most sweeps of one evaluation with everything known.
+    method : {"ep", "sample"}
+        "sample" draws Markov chains instead: exact in the limit, far slower, for linear models with uniform or
+        Gaussian noise. Its prior of a half-width is the power alone, without `told`.
+    draws, chains : int
+        Draws kept of each chain, and chains, of "sample".
 
     Notes
     -----
+    Of "sample" the spread is a `Cloud`, and ``info`` has ``rhat``, the largest rank-normalised split R-hat of states,
+    half-widths and entries, and ``ess``, their smallest effective number of draws; the status is REDUCED above an R-hat
+    of 1.01 and STALLED above 1.05. Of "ep":
+
     ``q``, ``r`` are posterior means. ``loglik`` is the logarithm of the evidence, half-widths integrated out under a
     prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
     count as a factor, not as a condition. In ``info``: ``x0``; ``half_widths``, a mapping with ``mean``, ``sd``, ``lo``
@@ -110,18 +119,29 @@ class Posterior:
     outliers: float | bool = False
     rounds: int = 20
     sweeps: int = 200
+    method: Literal["ep", "sample"] = "ep"
+    draws: int = 1000
+    chains: int = 4
 
     def __post_init__(self) -> None:
         if not isinstance(self.nodes, int | np.integer) or self.nodes < 1:
             raise BadValue(f"`nodes` is {self.nodes!r}, a positive whole number was expected")
         if not isinstance(self.outliers, bool) and not 0 <= self.outliers < 1:
             raise BadValue(f"`outliers` is {self.outliers!r}, a share from 0 below 1, or True, was expected")
-        for name in ("rounds", "sweeps"):
-            if not isinstance(getattr(self, name), int | np.integer) or getattr(self, name) < 1:
-                raise BadValue(f"`{name}` is {getattr(self, name)!r}, a positive whole number was expected")
+        for name, least in (("rounds", 1), ("sweeps", 1), ("draws", 8), ("chains", 1)):
+            if not isinstance(getattr(self, name), int | np.integer) or getattr(self, name) < least:
+                raise BadValue(f"`{name}` is {getattr(self, name)!r}, a whole number from {least} was expected")
+        if self.method not in ("ep", "sample"):
+            raise BadValue(f"`method` is {self.method!r}, 'ep' or 'sample' was expected")
 
     def refuses(self, model: Model) -> str | None:
         """Return why the model is none of this method, with a hint, or None."""
+        if self.method == "sample":
+            from halfwidth.methods import _sample
+
+            if self.outliers:
+                return "`Posterior(method='sample')` finds no outliers\nhint: method='ep'"
+            return _sample.refuses(model)
         reason, hint = self._reason(model)
         return None if reason is None else f"`Posterior` {reason}\nhint: {hint}"
 
@@ -164,8 +184,13 @@ class Posterior:
             return "needs independent outputs where they may be lost but `e` has a full covariance", "RBPF()"
         return None, ""
 
-    def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
-        """Estimate the states of one record."""
+    def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:
+        """Estimate the states of one record; `seed` is that of "sample"."""
+        if self.method == "sample":
+            from halfwidth.methods._sample import sampled
+
+            assert isinstance(model, Linear)
+            return sampled(self, model, record, draws=self.draws, chains=self.chains, power=POWER, seed=seed)
         if isinstance(model, Nonlinear):
             from halfwidth.methods._relinearise import relinearised
 
