@@ -51,7 +51,7 @@ _LIMITS = {
 #: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
 #: with them; there is less left to integrate.
 _LONG = 2000
-_FIRST = 400
+_FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
