@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
-from halfwidth.vehicle import calibrate, chain
+from halfwidth.vehicle import calibrate, chain, proven
 from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, usable
 from halfwidth.vehicle.estimators import method as method_of
@@ -66,6 +66,7 @@ def fill(
     level: float = 0.9,
     clock_offset: float | None = None,
     distrust: bool = True,
+    guaranteed: tuple[float, float] | None = None,
 ) -> Track:
     """Fill the gaps of a log.
 
@@ -84,6 +85,10 @@ def fill(
     distrust : bool
         Whether fixes that only repeat the one before while the car moves are found and bridged; the track's messages
         name them.
+    guaranteed : (float, float), optional
+        Declared half-widths: the acceleration that the car never passes, m/s^2, and the error that no fix passes, m,
+        each east and north. The track then has a band that must contain the car if both are true, in `Track.proven`;
+        it does not touch the half-widths. Fixes that contradict the two are named, and there is no band.
 
     Returns
     -------
@@ -100,6 +105,7 @@ def fill(
         If `level`, `method` or `clock_offset` is none.
     """
     level, offset = level_of(level), clock_offset_of(clock_offset)
+    bounds = None if guaranteed is None else proven.declared(guaranteed)
     asked = None if method is None else method_of(method)
     drive_log, native = as_log(log)
     if not drive_log.fixed.any():
@@ -128,6 +134,7 @@ def fill(
     gaps = gaps_of(t, lat, lon, half.max(axis=1), quality)
     settings: dict[str, object] = {"clock_offset": offset, "context": CONTEXT}
     settings.update(answers.settings)
+    band = None if bounds is None else _proven(drive_log, wanted, grid, columns, bounds, messages)
     return Track(
         t_s=t,
         lat_deg=lat,
@@ -149,7 +156,25 @@ def fill(
         settings=settings,
         messages=tuple(messages),
         native=native,
+        proven=band,
     )
+
+
+def _proven(
+    log: Log,
+    wanted: NDArray[np.intp],
+    grid: Grid,
+    columns: "_Columns",
+    bounds: tuple[float, float],
+    messages: list[str],
+) -> proven.Proven | None:
+    """Return the band of the declared half-widths, or say which fixes contradict them."""
+    east, north = grid.frame.to_local(log.lat_deg[wanted], log.lon_deg[wanted])
+    found = proven.band(log.t[wanted], np.column_stack((east, north)), *bounds)
+    if isinstance(found, str):
+        messages.append(f"no guaranteed band: the log contradicts the declared half-widths: {found}")
+        return None
+    return proven.about(columns.east, columns.north, *found, *bounds)
 
 
 def level_of(given: Any) -> float:
