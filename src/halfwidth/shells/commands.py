@@ -5,6 +5,7 @@ imported by the command that needs it.
 """
 
 import json
+import math
 import os
 import shlex
 import sys
@@ -126,6 +127,16 @@ def fill(
     report: Annotated[str | None, typer.Option(metavar="HTML", help="Report to write: one HTML page.")] = None,
     method: Annotated[str | None, typer.Option(metavar="NAME", help="Estimator; the default needs no tuning.")] = None,
     level: Level = 0.9,
+    guaranteed: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--guaranteed",
+            metavar="ACCELERATION FIX",
+            help="Add a band that must contain the vehicle while its acceleration stays within ACCELERATION m/s^2 and"
+            " every fix within FIX m of the truth, each east and north; in columns of its own.",
+            show_default=False,
+        ),
+    ] = None,
     clock_offset: ClockOffset = None,
     second: Annotated[
         str | None, typer.Option(metavar="LOG", help="Fixes of a second antenna on the same clock (method paper002).")
@@ -170,14 +181,18 @@ def fill(
         _writable(path, log, force)
     if output is not None:
         _ending_known(output, format_)
+    if guaranteed is not None and not all(0 < v < math.inf for v in guaranteed):
+        raise _usage(f"`--guaranteed` is {guaranteed[0]:g} {guaranteed[1]:g}, two positive numbers are expected",
+                     "--guaranteed 4 3")  # fmt: skip
     settings: dict[str, Any] = {"clock_offset": clock_offset}
     settings |= {name: value for name, value in (("second", second), ("roads", map_)) if value is not None}
+    if guaranteed is not None:
+        settings["guaranteed"] = list(guaranteed)
     if limits is not None:
         from halfwidth.vehicle.antennas import parsed_limits
 
         settings["limits"] = parsed_limits(limits)
-    job = Job("fill", log, method=method, level=level, settings=settings,
-              columns=parse_columns(columns or ""))  # fmt: skip
+    job = Job("fill", log, method=method, level=level, settings=settings, columns=parse_columns(columns or ""))
     if dry_run:
         found = read(log, columns=job.columns)
         outputs = [path for path in (output, report) if path is not None]
@@ -606,6 +621,9 @@ def _track_json(track: Any, written: Mapping[str, str | None], command: str, sec
             }
             for gap in track.gaps
         ],
+        "guaranteed": None
+        if track.proven is None
+        else {"acceleration": track.proven.acceleration, "fix": track.proven.fix, "rests_on": track.proven.words},
         "settings": dict(track.settings),
         "messages": list(track.messages),
         "written": dict(written),

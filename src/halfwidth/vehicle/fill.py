@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
-from halfwidth.vehicle import calibrate, chain
+from halfwidth.vehicle import calibrate, chain, proven
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import COLOURS, METHODS, Method, heading_of, usable, with_limits
@@ -77,6 +77,7 @@ def fill(
     second: Any = None,
     roads: Any = None,
     limits: Mapping[str, Any] | None = None,
+    guaranteed: tuple[float, float] | None = None,
 ) -> Track:
     """Fill the gaps of a log.
 
@@ -104,6 +105,10 @@ def fill(
     limits : mapping of str to float or (float, float), optional
         Largest size, or least and largest value, of ``speed`` (m/s), ``acceleration`` (m/s^2), ``yaw_rate`` (rad/s),
         ``altitude`` (m) and ``pitch`` (rad).
+    guaranteed : (float, float), optional
+        Declared half-widths: the acceleration that the car never passes, m/s^2, and the error that no fix passes, m,
+        each east and north. The track then has a band that must contain the car if both are true, in `Track.proven`;
+        it does not touch the half-widths. Fixes that contradict the two are named, and there is no band.
 
     Returns
     -------
@@ -120,6 +125,7 @@ def fill(
         If `level`, `method`, `clock_offset`, `roads` or one of `limits` is none, or the method does not take them.
     """
     level, offset = level_of(level), clock_offset_of(clock_offset)
+    bounds = None if guaranteed is None else proven.declared(guaranteed)
     asked = None if method is None else method_of(method)
     held = second is not None or roads is not None or limits is not None
     asked = with_limits(asked, limits, None) if held else asked
@@ -159,6 +165,7 @@ def fill(
     gaps = gaps_of(t, lat, lon, half.max(axis=1), quality)
     settings: dict[str, object] = {"context": CONTEXT, "sensors": sensors.to_dict()}
     settings.update(answers.settings)
+    band = None if bounds is None else _proven(drive_log, wanted, grid, columns, bounds, messages)
     return Track(
         t_s=t,
         lat_deg=lat,
@@ -180,7 +187,25 @@ def fill(
         settings=settings,
         messages=tuple(messages),
         native=native,
+        proven=band,
     )
+
+
+def _proven(
+    log: Log,
+    wanted: NDArray[np.intp],
+    grid: Grid,
+    columns: "_Columns",
+    bounds: tuple[float, float],
+    messages: list[str],
+) -> proven.Proven | None:
+    """Return the band of the declared half-widths, or say which fixes contradict them."""
+    east, north = grid.frame.to_local(log.lat_deg[wanted], log.lon_deg[wanted])
+    found = proven.band(log.t[wanted], np.column_stack((east, north)), *bounds)
+    if isinstance(found, str):
+        messages.append(f"no guaranteed band: the log contradicts the declared half-widths: {found}")
+        return None
+    return proven.about(columns.east, columns.north, *found, *bounds)
 
 
 def level_of(given: Any) -> float:
