@@ -228,7 +228,9 @@ def widths():
             f"{name:62}{np.mean(wide):8.4f}{max(outside):10.1e}{100 * np.mean(inside):10.1f}%{min(times):11.1f}{over}",
             flush=True,
         )
-    print("  width: mean over the exact hull's; outside: how far a box is inside the exact hull at worst, whose every end")
+    print(
+        "  width: mean over the exact hull's; outside: how far a box is inside the exact hull at worst, whose every end"
+    )
     print("  is reached by states that obey all bounds")
 
 

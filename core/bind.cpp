@@ -18,6 +18,7 @@ void bind_hull(nb::module_& m);
 void bind_constrain(nb::module_& m);
 void bind_noise(nb::module_& m);
 void bind_sampler(nb::module_& m);
+void bind_mixed(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -38,4 +39,5 @@ NB_MODULE(_core, m) {
     bind_constrain(m);
     bind_noise(m);
     bind_sampler(m);
+    bind_mixed(m);
 }

@@ -513,14 +513,15 @@ struct Zonotope {
         for (int l = 0; l < rows; l++) q.y[l] = 0.0;
         for (int j = 0; j < k; j++)
             if (q.free[j] >= k) q.y[q.free[j] - k] = -q.d[j];
-        return feasible ? bound(q.cost, q.y) : inf;
+        const double safe = feasible ? bound(q.cost, q.y) : inf;
+        return safe == safe ? safe : inf;
     }
 
-    // y b + t |y| + |g - y A|_1, rounded up; of any y
+    // y b + t |y| + |g - y A|_1, rounded up; of any y, g = 0 where it is null
     double bound(const double* objective, const double* y) {
         const int k = generators(), rows = constraints();
         double total = 0.0, size = 0.0;
-        for (int j = 0; j < k; j++) g[j] = objective[j], score[j] = size_of(objective[j]);
+        for (int j = 0; j < k; j++) g[j] = objective ? objective[j] : 0.0, score[j] = size_of(g[j]);
         for (int l = 0; l < rows; l++) {
             if (y[l] == 0.0) continue;
             const double* row = A + std::size_t(l) * cap;
@@ -543,10 +544,9 @@ struct Zonotope {
         for (int j = 0; j < k; j++)
             if (q.free[j] >= k) q.y[q.free[j] - k] = row[j];
         if (q.basic[out] >= k) q.y[q.basic[out] - k] = 1.0;
-        for (int j = 0; j < k; j++) q.cost[j] = 0.0;
-        if (bound(q.cost, q.y) < 0.0) return true;
+        if (bound(nullptr, q.y) < 0.0) return true;
         for (int l = 0; l < rows; l++) q.y[l] = -q.y[l];
-        return bound(q.cost, q.y) < 0.0;
+        return bound(nullptr, q.y) < 0.0;
     }
 
     bool sound() const {

@@ -22,6 +22,7 @@ _HOME: dict[str, str] = {
     "Box": "spread",
     "Halfspaces": "spread",
     "Normal": "spread",
+    "Both": "spread",
     "Cloud": "spread",
     "Bernoulli": "loss",
     "Markov": "loss",
@@ -38,10 +39,10 @@ _HOME: dict[str, str] = {
     "resume": "stream",
     "forecast": "forecast",
     "ensemble_interval": "methods.window",
-    "choose_memory": "methods.window",
     "bound": "bound",
     "Bound": "methods._functional",
-    "MemoryChoice": "methods.window",
+    "choose_memory": "methods.memory",
+    "MemoryChoice": "methods.memory",
     "learn": "learn",
     "Learned": "learn",
     "HalfwidthError": "errors",
@@ -94,6 +95,10 @@ if TYPE_CHECKING:
     from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
     from halfwidth.methods.loss import Runnalls as Runnalls
     from halfwidth.methods.map import BatchLP as BatchLP
+    from halfwidth.methods.memory import MemoryChoice as MemoryChoice
+    from halfwidth.methods.memory import choose_memory as choose_memory
+    from halfwidth.methods.mixed import MixedFilter as MixedFilter
+    from halfwidth.methods.mixed_window import MixedWindow as MixedWindow
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
@@ -102,9 +107,7 @@ if TYPE_CHECKING:
     from halfwidth.methods.sets import EllipsoidFilter as EllipsoidFilter
     from halfwidth.methods.sets import IntervalFilter as IntervalFilter
     from halfwidth.methods.sets import ZonotopeFilter as ZonotopeFilter
-    from halfwidth.methods.window import MemoryChoice as MemoryChoice
     from halfwidth.methods.window import Window as Window
-    from halfwidth.methods.window import choose_memory as choose_memory
     from halfwidth.methods.window import ensemble_interval as ensemble_interval
     from halfwidth.model import Linear as Linear
     from halfwidth.model import Nonlinear as Nonlinear
@@ -116,6 +119,7 @@ if TYPE_CHECKING:
     from halfwidth.result import Status as Status
     from halfwidth.score import score as score
     from halfwidth.simulate import simulate as simulate
+    from halfwidth.spread import Both as Both
     from halfwidth.spread import Box as Box
     from halfwidth.spread import Cloud as Cloud
     from halfwidth.spread import Halfspaces as Halfspaces
@@ -123,4 +127,4 @@ if TYPE_CHECKING:
     from halfwidth.stream import resume as resume
     from halfwidth.stream import stream as stream
 
-lazy(__name__, _HOME | {"vehicle": "vehicle"})
+lazy(__name__, _HOME | {"vehicle": "vehicle", "fusion": "fusion"})

@@ -20,6 +20,7 @@ DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("UnscentedKalman", {"smooth": True}),
     ("GPB", {"depth": 5, "smooth": True}),
     ("BatchLP", {}),
+    ("MixedFilter", {}),
     ("ParticleFilter", {}),
 )
 

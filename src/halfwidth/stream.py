@@ -140,6 +140,7 @@ def _default(model: Model) -> Any:
     reasons = []
     defaults: tuple[tuple[str, dict[str, Any]], ...] = (
         ("KalmanFilter", {}), ("Hull", {"memory": 10}), ("ZonotopeFilter", {}), ("UnscentedKalman", {}), ("GPB", {}),
+        ("MixedFilter", {}),
     )  # fmt: skip
     for name, settings in defaults:
         method = methods.load(name)(**settings)

@@ -63,14 +63,16 @@ def test_noise_in_the_corners_with_entries_missing(method):
 def test_drawn_models_of_all_scales(seed, nx, ny, unit, share, quiet):
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(nx, nx))
-    A *= rng.uniform(0.2, 1.3) / max(np.abs(np.linalg.eigvals(A)).max(), 1e-3)
+    A *= rng.uniform(0.2, 1.1) / max(np.abs(np.linalg.eigvals(A)).max(), 1e-3)
+    E = np.eye(nx) + (seed % 2) * np.triu(rng.normal(size=(nx, nx)), 1)
+    A = E @ A  # so that E^-1 A is what grows or decays
     scale = unit * 10.0 ** rng.uniform(-2, 2, nx)  # units differ from state to state
     q = np.where(quiet in ("w", "both"), 0.0, scale * rng.uniform(0, 1, nx))
     C = rng.normal(size=(ny, nx)) / scale
     r = np.where(quiet in ("e", "both"), 0.0, rng.uniform(0, 1, ny))
     model = hw.Linear(
         scale[:, None] * A / scale, None, C, hw.Uniform(q), hw.Uniform(r), hw.Box(-scale, scale),
-        E=np.eye(nx) + np.triu(rng.normal(size=(nx, nx)), 1) * scale[:, None] / scale if seed % 2 else None,
+        E=scale[:, None] * E / scale if seed % 2 else None,
     )  # fmt: skip
     # without output noise the simulated outputs themselves are rounded, so a hair is declared
     hair = 1e-12 * (np.abs(C) @ scale + 1.0) * (1e3 if quiet in ("e", "both") else 1.0)
@@ -78,6 +80,21 @@ def test_drawn_models_of_all_scales(seed, nx, ny, unit, share, quiet):
     truth, record = cornered(model, 25, seed, share)
     for method in SETS:
         assert contains(hw.estimate(declared, record, method), truth), method
+
+
+@pytest.mark.parametrize("seed", [26, 421, 1345])
+def test_noise_in_the_corners_that_leaves_hardly_any_room(seed):
+    """Outputs in their corners pin the state down to 1e-11: programs of such sets end early, and must still contain."""
+    rng = np.random.default_rng(seed)
+    for nx, ny in ((1, 2), (2, 2), (2, 3), (3, 3)):
+        A = rng.normal(size=(nx, nx))
+        A *= rng.uniform(0.2, 1.1) / max(np.abs(np.linalg.eigvals(A)).max(), 1e-3)
+        q, r = rng.uniform(0, 1, nx), rng.uniform(0, 1, ny)
+        model = hw.Linear(A, None, rng.normal(size=(ny, nx)), hw.Uniform(q), hw.Uniform(r), hw.Box(-1, 1))
+        model = dataclasses.replace(model, x0=hw.Box(-np.ones(nx), np.ones(nx)))
+        truth, record = cornered(model, 60, seed, lost=0.0)
+        for method in (*SETS, hw.ConstrainedZonotopeFilter(order=40, constraints=40)):
+            assert contains(hw.estimate(model, record, method), truth), (method, nx, ny)
 
 
 @EVERY

@@ -21,11 +21,13 @@ ESTIMATORS: dict[str, str] = {
     "SequentialLP": "sequential",
     "Window": "window",
     "Hull": "hull",
+    "Constrained": "constrain",
+    "MixedFilter": "mixed",
+    "MixedWindow": "mixed_window",
     "IntervalFilter": "sets",
     "ZonotopeFilter": "sets",
     "ConstrainedZonotopeFilter": "sets",
     "EllipsoidFilter": "sets",
-    "Constrained": "constrain",
 }
 
 
