@@ -148,6 +148,7 @@ def fill(
     chosen = _chosen(grid, asked, messages)
     wanted, quality = _wanted(drive_log)
     t = drive_log.t[wanted]
+    believed = grid.seen
     if distrust:
         stray = strays(grid, sensors)
         messages.extend(filter(None, [stray.words(grid)]))
@@ -161,11 +162,15 @@ def fill(
     z = NormalDist().inv_cdf(0.5 + level / 2)
     half = _half_widths(columns, answers, grid, away, z, t, quality)
     arm_east, arm_north = sensors.arm(t)
-    lat, lon = grid.frame.to_geodetic(columns.east + arm_east, columns.north + arm_north)
+    east, north = columns.east + arm_east, columns.north + arm_north
+    lat, lon = grid.frame.to_geodetic(east, north)
     gaps = gaps_of(t, lat, lon, half.max(axis=1), quality)
     settings: dict[str, object] = {"context": CONTEXT, "sensors": sensors.to_dict()}
     settings.update(answers.settings)
-    band = None if bounds is None else _proven(drive_log, wanted, grid, columns, bounds, messages)
+    band = None
+    if bounds is not None:
+        off = np.isin(t, grid.t[believed & ~grid.seen])  # what is not believed bounds nothing
+        band = _proven(drive_log, wanted, off, grid, np.column_stack((east, north)), bounds, messages)
     return Track(
         t_s=t,
         lat_deg=lat,
@@ -194,18 +199,21 @@ def fill(
 def _proven(
     log: Log,
     wanted: NDArray[np.intp],
+    off: NDArray[np.bool_],
     grid: Grid,
-    columns: "_Columns",
+    track: Floats,
     bounds: tuple[float, float],
     messages: list[str],
 ) -> proven.Proven | None:
-    """Return the band of the declared half-widths, or say which fixes contradict them."""
+    """Return the band of the declared half-widths about a track (M, 2), or say which fixes contradict them."""
     east, north = grid.frame.to_local(log.lat_deg[wanted], log.lon_deg[wanted])
-    found = proven.band(log.t[wanted], np.column_stack((east, north)), *bounds)
+    fixes = np.column_stack((east, north))
+    fixes[off] = np.nan
+    found = proven.band(log.t[wanted], fixes, *bounds)
     if isinstance(found, str):
         messages.append(f"no guaranteed band: the log contradicts the declared half-widths: {found}")
         return None
-    return proven.about(columns.east, columns.north, *found, *bounds)
+    return proven.about(track[:, 0], track[:, 1], *found, *bounds)
 
 
 def level_of(given: Any) -> float:
