@@ -1,8 +1,9 @@
 """The structured interior point beside PIQP, HiGHS (simplex and interior point) and Clarabel; windows beside linprog.
 
-Run ``python benchmarks/lp.py [--quick]`` or ``--agreement N`` for N random problems against HiGHS. Times are medians of
-process CPU time; n = 4, m = 2, 20 % of the rows in outages. The last column of the first table counts what an iteration
-must at least move and compute, and how far we are from it.
+Run ``python benchmarks/lp.py [--quick]``, ``--windows``, ``--failures`` for the windows of 2,500 rows that are not
+solved, or ``--agreement N`` for N random problems against HiGHS. Times are medians of CPU time; n = 4, m = 2, 20 % of
+the rows in outages. The last column of the first table counts what an iteration must at least move and compute, and how
+far we are from it.
 """
 
 import statistics
@@ -13,7 +14,10 @@ import numpy as np
 import scipy.optimize
 
 from halfwidth import _core
+from halfwidth.methods.map import BatchLP
+from halfwidth.methods.window import window_chain
 from halfwidth.reproduce import paper003
+from halfwidth.result import Status
 from halfwidth.solvers.banded import Chain, solve
 from halfwidth.solvers.lp import PIQP, highs
 
@@ -123,36 +127,67 @@ def batch(lengths, quick):
 def windows(rows):
     print(f"\n{'memory':>8} {'point':>10} {'median us':>10} {'p99/median':>11} {'it':>5} {'unsolved':>9}")
     model = paper003.system(unknown=False, correlated=False)
+    step = {}
     for memory in (5, 10, 25, 50):
         for point in ("optimal", "central"):
             drawn = paper003.draw(0, correlated=False, rows=rows)
             est = paper003.lsu(drawn, memory, model, point=point)
             took = est.info["seconds"][memory:]
-            middle = 1e6 * np.median(took)
+            step[memory, point] = middle = 1e6 * np.median(took)
             print(
-                f"{memory:8d} {point:>10} {middle:10.1f} {1e6 * np.quantile(took, 0.99) / middle:11.1f}"
+                f"{memory:8d} {point:>10} {middle:10.1f} {np.quantile(1e6 * took, 0.99) / middle:11.1f}"
                 f" {est.info['iterations'].mean():5.1f} {len(est.info['unsolved']):9d}"
             )
-    from halfwidth.methods.map import BatchLP
-    from halfwidth.methods.window import window_chain
+    peers(step[25, "optimal"], step[25, "central"])
 
-    chain = window_chain(BatchLP(objective="paper"), model, paper003.draw(0, correlated=False, rows=60).record, 25)
-    part = chain.part(30, 56)
-    program = part.program()
-    up = np.isfinite(program.row_hi)
+
+def peers(optimal, central):
+    """Solve some of the same windows with PIQP and linprog, and one of them alone from Python."""
     import scipy.sparse as sp
 
-    G = sp.csr_array(sp.vstack([program.G[up], -program.G[~up]]))
-    b = np.r_[program.row_hi[up], -program.row_lo[~up]]
-    bounds = np.c_[program.lo, program.hi]
-    ours, _ = cpu(lambda: [solve(part, point="optimal", fallback=False) for _ in range(200)], 5)
-    central, _ = cpu(lambda: [solve(part, fallback=False) for _ in range(200)], 5)
-    piqp, _ = cpu(lambda: [PIQP.run(program) for _ in range(20)], 3)
-    lin, _ = cpu(lambda: [scipy.optimize.linprog(program.c, G, b, bounds=bounds) for _ in range(5)], 3)
+    model = paper003.system(unknown=False, correlated=False)
+    chain = window_chain(BatchLP(objective="paper"), model, paper003.draw(0, correlated=False, rows=400).record, 25)
+    alone, piqp, lin = [], [], []
+    for first in range(30, 370, 20):
+        part = chain.part(first, first + 26)
+        program = part.program()
+        up = np.isfinite(program.row_hi)
+        G = sp.csr_array(sp.vstack([program.G[up], -program.G[~up]]))
+        b = np.r_[program.row_hi[up], -program.row_lo[~up]]
+        bounds = np.c_[program.lo, program.hi]
+        alone.append(cpu(lambda p=part: [solve(p, point="optimal", fallback=False) for _ in range(20)], 3)[0] / 20)
+        piqp.append(cpu(lambda p=program: [PIQP.run(p) for _ in range(3)], 3)[0] / 3)
+        lin.append(cpu(lambda p=program, g=G, h=b, e=bounds: scipy.optimize.linprog(p.c, g, h, bounds=e), 3)[0])
+    alone, piqp, lin = (1e6 * statistics.median(v) for v in (alone, piqp, lin))
     print(
-        f"one window of memory 25 from Python, us: optimal {5e3 * ours:.0f}, central {5e3 * central:.0f},"
-        f" PIQP {5e4 * piqp:.0f} ({10 * piqp / ours:.1f}x), linprog {2e5 * lin:.0f} ({40 * lin / ours:.0f}x)"
+        f"memory 25, medians in us: a step of the window {optimal:.1f} (central {central:.1f}), a program alone from"
+        f" Python {alone:.1f}, PIQP {piqp:.0f}, linprog {lin:.0f}"
     )
+    print(
+        f"a step is {lin / optimal:.0f} times as fast as linprog and {piqp / optimal:.1f} times as PIQP;"
+        f" a program alone {lin / alone:.0f} and {piqp / alone:.1f} times"
+    )
+
+
+def failures(rows):
+    """Count windows that were not solved: 5 seeds, 4 memories, theta known and estimated, both points."""
+    print(f"{'memory':>8} {'theta':>10} {'point':>9} {'windows':>8} {'unsolved':>9} {'reduced':>8} {'us':>6}")
+    for unknown in (False, True):
+        model = paper003.system(unknown=unknown)
+        for memory in (5, 10, 25, 50):
+            for point in ("optimal", "central"):
+                bad = reduced = 0
+                start = time.process_time()
+                for seed in range(5):
+                    est = paper003.lsu(paper003.draw(seed, rows=rows), memory, model, point=point)
+                    bad += len(est.info["unsolved"])
+                    reduced += est.info["statuses"].count(Status.REDUCED)
+                each = 1e6 * (time.process_time() - start) / (5 * rows)
+                print(
+                    f"{memory:8d} {'estimated' if unknown else 'known':>10} {point:>9} {5 * rows:8d} {bad:9d}"
+                    f" {reduced:8d} {each:6.0f}",
+                    flush=True,
+                )
 
 
 def memory_of(T):
@@ -173,16 +208,19 @@ def agreement(problems):
 
     sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
     from tests.core.test_lp import judged
+    from tests.naive_lp import problem
 
-    wrong, helped, kinds = [], {}, {}
+    wrong, helped, statuses = [], {}, {}
     for seed in range(problems):
         kind, fault, help_ = judged(seed)
-        kinds[kind] = kinds.get(kind, 0) + 1
+        status = solve(problem(seed)[1], point="optimal").status.name
+        statuses[status] = statuses.get(status, 0) + 1
         helped[kind] = helped.get(kind, 0) + help_
         if fault:
             wrong.append((seed, kind, fault))
             print(seed, kind, fault)
     print(f"{len(wrong)} of {problems} disagree; stock solvers were needed for {sum(helped.values())}: {helped}")
+    print(f"statuses: {statuses}")
 
 
 def main(quick=False):
@@ -196,5 +234,9 @@ def main(quick=False):
 if __name__ == "__main__":
     if "--agreement" in sys.argv:
         agreement(int(sys.argv[sys.argv.index("--agreement") + 1]))
+    elif "--failures" in sys.argv:
+        failures(250 if "--quick" in sys.argv else paper003.T)
+    elif "--windows" in sys.argv:
+        windows(500 if "--quick" in sys.argv else 10_000)
     else:
         main("--quick" in sys.argv)

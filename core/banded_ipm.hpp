@@ -24,6 +24,7 @@
 // after the least-squares start everything is measured from it, in units S of its largest residual.
 #pragma once
 
+#include "carver.hpp"
 #include "chain.hpp"
 #include "lp_types.hpp"
 
@@ -31,64 +32,61 @@ namespace hw {
 namespace HW_ISA {
 
 constexpr double lp_inf = 1e300;     // bounds at or beyond this are absent
+constexpr double lp_warm_gap = 0.1;  // relative gap of the iterate that the next window starts from
 constexpr double lp_pinned = 1e100;  // added to the diagonal of a variable that must not move
 
-// hands out pieces of the caller's workspace, aligned to 64 bytes; with base == null it only counts
-struct Carver {
-    char* base;
-    std::size_t used = 0;
-    template <class V>
-    V* take(std::ptrdiff_t count) {
-        used = (used + 63) / 64 * 64;
-        V* p = base ? reinterpret_cast<V*>(base + used) : nullptr;
-        used += static_cast<std::size_t>(count) * sizeof(V);
-        return p;
-    }
-    template <class... Vs>
-    void many(std::ptrdiff_t count, Vs*&... arrays) {
-        ((arrays = take<Vs>(count)), ...);
+// The sizes that are compiled for: n alone (0: not even that), or n and m of a plain program, which has no theta, no E,
+// no slacks and as many half-widths as kinds of rows.
+template <int N, int Y>
+struct Shape {
+    static constexpr int m = Y, rows = N + Y, p0 = 0, ns = N + Y, p = N + Y;
+    static constexpr bool soft = false, unit_E = true;
+    explicit Shape(const LpProblem&) {}
+    static bool fits(const LpProblem& lp) {
+        return lp.n == N && lp.m == Y && lp.ns == N + Y && lp.p0 == 0 && !lp.E && !lp.slack;
     }
 };
+template <int N>
+struct Shape<N, 0> {
+    const int m, rows, p0, ns, p;  // p = p0 + ns border columns
+    const bool soft, unit_E;
+    explicit Shape(const LpProblem& lp)
+        : m(lp.m), rows(lp.n + lp.m), p0(lp.p0), ns(lp.ns), p(lp.p0 + lp.ns), soft(lp.slack), unit_E(!lp.E) {}
+};
 
-template <int P, int N>
-struct BandedIpm {
+template <int P, int N, int Y>
+struct BandedIpm : Shape<N, Y> {
     using V = Lanes<P>;
     using I = std::ptrdiff_t;
+    using Size = Shape<N, Y>;
+    using Size::m, Size::rows, Size::p0, Size::ns, Size::p, Size::soft, Size::unit_E;
     const LpProblem& lp;
     const LpSettings& set;
     Dim<N> n;
-    int m, rows, G, p0, ns, p, H, pc;  // G pairs a state: rows, then boxes; pc border columns in use of p = p0 + ns
-    I pw, zq;                          // pair entries a state: 2 G, then a slack a row; entries of Z a state
-    bool boxed, soft, unit_E, capped;
+    const bool boxed;
+    const int G;  // pairs a state: rows, then boxes
+    const I pw, zq;  // pair entries a state: 2 G, then a slack a row; entries of Z a state
+    const int H;
+    bool capped;
 
     // the problem in scaled units, lane by lane; a stride of 0 marks a constant matrix
     V *E, *Ed, *A, *C, *Gt, *b, *base, *xlo, *xhi;
     I dE, dA, dC;
     // iterate, directions, the reference that b is relative to, the best iterate so far
-    V *x, *w, *l, *u, *v, *dx, *px, *xref, *xbest, *lbest, *wbest;
+    V *x, *w, *l, *u, *v, *dx, *px, *xref, *xbest, *lbest, *wbest, *xwarm, *lwarm;
     // factor and right-hand side
     V *L, *O, *Z, *f, *Q, *K, *acc, *zacc;
     // one state's worth of scratch
     V *W, *Sg, *Ws, *nu, *rho, *own, *bef, *bef0, *back, *back0, *Bb, *Bb0, *wk, *dres, *lz, *left, *dzv;
     // the dense end: z = (theta, s), its bounds as pairs, its Schur complement, the chain of separators
-    double *sx, *kappa, *cz, *sz, *z, *dz, *zref, *kz, *zbest, *zlo, *zhi, *zw, *zl, *zu, *zv, *zrp, *zlbest;
+    double *sx, *kappa, *cz, *sz, *z, *dz, *zref, *kz, *zbest, *zlo, *zhi, *zw, *zl, *zu, *zv, *ze, *zrp, *zlbest, *zwarm, *zlwarm;
     double *Kd, *KL, *Kpiv, *Kinv, *Korig, *zcg, *pz, *rM, *rO, *rZ, *rQ, *rf, *rx, *racc, *rw, *hmax, *count;
-    double S, reg, drop, mu_pairs;
+    double S, reg, drop, mu_pairs, rounding;  // what the largest state leaves of a residual, in units S
     double objective, comp, dinf, pinf, dual;  // of the current iterate, set by `assemble`
 
-    BandedIpm(const LpProblem& lp_, const LpSettings& set_) : lp(lp_), set(set_), n(lp_.n) {
-        m = lp.m;
-        rows = n + m;
-        boxed = lp.lo != nullptr || lp.x0_lo != nullptr;
-        soft = lp.slack != nullptr;
-        G = rows + (boxed ? int(n) : 0);
-        pw = 2 * G + (soft ? rows : 0);
-        p0 = lp.p0;
-        ns = lp.ns;
-        p = pc = p0 + ns;
-        zq = I(n) * (n + p);
-        H = (lp.T + P) / P;
-        unit_E = lp.E == nullptr;
+    BandedIpm(const LpProblem& lp_, const LpSettings& set_)
+        : Size(lp_), lp(lp_), set(set_), n(lp_.n), boxed(lp_.lo || lp_.x0_lo), G(rows + (boxed ? int(n) : 0)),
+          pw(2 * G + (soft ? rows : 0)), zq(I(n) * (n + p)), H((lp_.T + P) / P) {
         dE = lp.E_t ? n * n : 0;
         dA = lp.A_t ? n * n : 0;
         dC = lp.C_t ? m * n : 0;
@@ -110,6 +108,8 @@ struct BandedIpm {
         c.many(h * n, x, dx, xref, xbest, f, px);
         c.many(h * pw, w, l, u, v, lbest);
         wbest = c.take<V>(soft ? h * pw : 0);
+        xwarm = c.take<V>(set.warm ? h * n : 0);
+        lwarm = c.take<V>(set.warm ? h * pw : 0);
         L = c.take<V>(h * nn);
         O = c.take<V>(h * nn);
         Z = c.take<V>(h * zq);
@@ -124,8 +124,8 @@ struct BandedIpm {
         wk = c.take<V>(2 * n);
         sx = c.take<double>(n);
         c.many(rows, kappa, hmax, count);
-        c.many(p, cz, sz, z, dz, zref, kz, zbest, zlo, zhi, Kpiv, Kinv, racc, Korig, zcg, pz);
-        c.many(2 * p, zw, zl, zu, zv, zrp, zlbest);
+        c.many(p, cz, sz, z, dz, zref, kz, zbest, zlo, zhi, Kpiv, Kinv, racc, Korig, zcg, pz, zwarm);
+        c.many(2 * p, zw, zl, zu, zv, ze, zrp, zlbest, zlwarm);
         c.many(I(p) * p, Kd, KL);
         c.many(P * nn, rM, rO);
         rZ = c.take<double>(I(P) * n * p);
@@ -181,16 +181,24 @@ struct BandedIpm {
 
     // weights of row or box j at place i: W on (rho,rho), Sj on (rho,s), Wsj on (s,s); a slack is eliminated here
     inline void weigh(const V* wi, const V* li, int j, V& Wj, V& Sj, V& Wsj) const {
-        const V dp = li[2 * j] / wi[2 * j], dm = li[2 * j + 1] / wi[2 * j + 1];
-        const V Wd = dp + dm, Sd = dm - dp;
+        V Wd, Sd, de;
+        slopes(wi, li, j, Wd, Sd, de);
         Wj = Wsj = Wd;
         Sj = Sd;
         if (soft && j < rows) {
-            const V de = li[2 * G + j] / wi[2 * G + j], r = V(1.0) / larger(Wd + de, V(1e-300));
-            Wj = Wd - Sd * Sd * r;
-            Sj = Sd * de * r;
-            Wsj = Wd * de * r;
+            const V over = V(1.0) / larger(Wd + de, V(1e-300));
+            Wj = Wd - Sd * Sd * over;
+            Sj = Sd * de * over;
+            Wsj = Wd * de * over;
         }
+    }
+
+    // d = l / w of a pair, as sum and difference, and of its slack
+    inline void slopes(const V* wi, const V* li, int j, V& Wd, V& Sd, V& de) const {
+        const V dp = li[2 * j] / wi[2 * j], dm = li[2 * j + 1] / wi[2 * j + 1];
+        Wd = dp + dm;
+        Sd = dm - dp;
+        de = soft && j < rows ? li[2 * G + j] / wi[2 * G + j] : V(0.0);
     }
 
     // ---- forward: assemble and factor -----------------------------------------------------------------------------
@@ -198,9 +206,9 @@ struct BandedIpm {
     // Take the step (ap, ad) along (u, v), measure the new iterate, and factor Newton's matrix there.
     void assemble(double ap, double ad, bool step, bool measure) {
         const I nn = I(n) * n;
-        const int q = n + pc;
+        const int q = n + p;
         for (int c = 0; c < tri(q, 0); c++) Q[c] = V(0.0);
-        for (int c = 0; c < pc * pc; c++) K[c] = V(0.0);
+        for (int c = 0; c < p * p; c++) K[c] = V(0.0);
         for (int c = 0; c < p; c++) zacc[c] = V(0.0);
         V gap_sum(0.0), res_sum(0.0), dual_sum(0.0), slack_sum(0.0);
         const V a_p(ap), a_d(ad);
@@ -239,12 +247,12 @@ struct BandedIpm {
             if (i > 0) {
                 V *Lb = L + (i - 1) * nn, *Zb = Z + (i - 1) * zq;
                 add_lower(back, Lb);
-                for (int k = 0; k < n * pc; k++) Zb[nn + k] += Bb[k];
+                for (int k = 0; k < n * p; k++) Zb[nn + k] += Bb[k];
                 chain_close(n, q, Lb, Zb, Q, drop, wk);
                 chain_link(n, q, O + i * nn, Lb, Zb, L + i * nn, Z + i * zq, wk);
             } else {
                 for (int k = 0; k < nn; k++) back0[k] = back[k];
-                for (int k = 0; k < n * pc; k++) Bb0[k] = Bb[k];
+                for (int k = 0; k < n * p; k++) Bb0[k] = Bb[k];
             }
         }
         if (measure) {
@@ -253,6 +261,11 @@ struct BandedIpm {
             measure_dense(sum_lanes(gap_sum), sum_lanes(res_sum), sum_lanes(dual_sum), sum_lanes(slack_sum));
         }
         separators();
+    }
+
+    // a / (w l) of a pair, 0 where there is no row
+    static inline V share(const V& a, const V& w_, const V& l_) {
+        return where_positive(l_, a / (w_ * where_positive(l_, l_, V(1.0))), V(0.0));
     }
 
     inline V residual_of(I i, const V* after) const {
@@ -297,7 +310,7 @@ struct BandedIpm {
                 Oi[r * n + c] = s;
                 Zi[c * n + r] = i == 0 ? s : V(0.0);
             }
-        for (int k = 0; k < n * pc; k++) B[k] = Bb[k] = V(0.0);
+        for (int k = 0; k < n * p; k++) B[k] = Bb[k] = V(0.0);
         for (int c = 0; c < p0; c++)
             for (int j = 0; j < rows; j++) {
                 const V wg = W[j] * g[j * p0 + c];
@@ -307,9 +320,8 @@ struct BandedIpm {
                     else B[c * n + k] += Ei[j * n + k] * wg;
                     if (j < n) Bb[c * n + k] -= Ai[j * n + k] * wg;
                 }
-                for (int d = 0; d <= c; d++) K[c * pc + d] += wg * g[j * p0 + d];
+                for (int d = 0; d <= c; d++) K[c * p + d] += wg * g[j * p0 + d];
             }
-        if (pc == p0) return;
         for (int j = 0; j < n; j++) {
             const int s = p0 + lp.group[j];
             for (int k = 0; k < n; k++) {
@@ -325,8 +337,8 @@ struct BandedIpm {
             for (int k = 0; k < n; k++) B[(p0 + lp.group[n + j]) * n + k] += Ci[j * n + k] * Sg[n + j];
         for (int j = 0; j < rows; j++) {
             const int s = p0 + lp.group[j];
-            K[s * pc + s] += Ws[j];
-            for (int c = 0; c < p0; c++) K[s * pc + c] += Sg[j] * g[j * p0 + c];
+            K[s * p + s] += Ws[j];
+            for (int c = 0; c < p0; c++) K[s * p + c] += Sg[j] * g[j * p0 + c];
         }
     }
 
@@ -342,23 +354,23 @@ struct BandedIpm {
         for (int r = 0; r < n; r++)
             for (int c = 0; c < n; c++)
                 for (int k = 0; k < P; k++) rO[k * nn + r * n + c] = Zs[c * n + r][k];
-        for (int c = 0; c < pc; c++)
+        for (int c = 0; c < p; c++)
             for (int r = 0; r < n; r++) {
                 const V s = Zs[nn + c * n + r] + from_after(Bb0[c * n + r] - Q[tri(n + c, r)]);
-                for (int k = 0; k < P; k++) rZ[(I(k) * pc + c) * n + r] = s[k];
+                for (int k = 0; k < P; k++) rZ[(I(k) * p + c) * n + r] = s[k];
             }
-        for (int c = 0; c < tri(pc, 0); c++) rQ[c] = 0.0;
-        chain_factor(n, P, pc, rM, rO, rZ, rQ, drop, rw);
-        for (int c = 0; c < pc; c++)
+        for (int c = 0; c < tri(p, 0); c++) rQ[c] = 0.0;
+        chain_factor(n, P, p, rM, rO, rZ, rQ, drop, rw);
+        for (int c = 0; c < p; c++)
             for (int d = 0; d <= c; d++) {
-                double s = sum_lanes(K[c * pc + d] - Q[tri(n + c, n + d)]) - rQ[tri(c, d)];
+                double s = sum_lanes(K[c * p + d] - Q[tri(n + c, n + d)]) - rQ[tri(c, d)];
                 if (c == d) {
-                    Korig[c] = sum_lanes(K[c * pc + c]);
+                    Korig[c] = sum_lanes(K[c * p + c]);
                     s += reg;
-                    if (pc == p) s += zl[2 * c] / zw[2 * c] + zl[2 * c + 1] / zw[2 * c + 1];
+                    s += zl[2 * c] / zw[2 * c] + zl[2 * c + 1] / zw[2 * c + 1];
                     if (zhi[c] == zlo[c]) s += lp_pinned;
                 }
-                Kd[c * pc + d] = Kd[d * pc + c] = s;
+                Kd[c * p + d] = Kd[d * p + c] = s;
             }
         dense_factor();
     }
@@ -367,16 +379,16 @@ struct BandedIpm {
     // half-width then moves too little, never too far.
     void dense_factor() {
         const double tiny = 1e-15;
-        for (int j = 0; j < pc; j++) {
-            double d = Kd[j * pc + j];
-            for (int k = 0; k < j; k++) d -= KL[j * pc + k] * KL[j * pc + k] * Kpiv[k];
+        for (int j = 0; j < p; j++) {
+            double d = Kd[j * p + j];
+            for (int k = 0; k < j; k++) d -= KL[j * p + k] * KL[j * p + k] * Kpiv[k];
             d = max2(d, tiny * std::fabs(Korig[j]));
             Kpiv[j] = d;
             Kinv[j] = 1.0 / d;
-            for (int i = j + 1; i < pc; i++) {
-                double s = Kd[i * pc + j];
-                for (int k = 0; k < j; k++) s -= KL[i * pc + k] * KL[j * pc + k] * Kpiv[k];
-                KL[i * pc + j] = s * Kinv[j];
+            for (int i = j + 1; i < p; i++) {
+                double s = Kd[i * p + j];
+                for (int k = 0; k < j; k++) s -= KL[i * p + k] * KL[j * p + k] * Kpiv[k];
+                KL[i * p + j] = s * Kinv[j];
             }
         }
     }
@@ -387,7 +399,7 @@ struct BandedIpm {
     template <class RowFn>
     void forward(RowFn row) {
         const I nn = I(n) * n;
-        const int q = n + pc;
+        const int q = n + p;
         for (int c = 0; c < q; c++) acc[c] = V(0.0);
         for (int c = 0; c < p; c++) zacc[c] = V(0.0);
         for (I i = 0; i < H; i++) {
@@ -412,9 +424,9 @@ struct BandedIpm {
             const V s = f[(H - 1) * n + k] + from_after(bef0[k] - acc[k]);
             for (int t = 0; t < P; t++) rf[t * n + k] = s[t];
         }
-        for (int c = 0; c < pc; c++) racc[c] = 0.0;
-        chain_forward(n, P, pc, rM, rO, rZ, rf, racc, rw);
-        for (int c = 0; c < pc; c++) kz[c] = sum_lanes(zacc[c] - acc[n + c]) - racc[c] - cz[c];
+        for (int c = 0; c < p; c++) racc[c] = 0.0;
+        chain_forward(n, P, p, rM, rO, rZ, rf, racc, rw);
+        for (int c = 0; c < p; c++) kz[c] = sum_lanes(zacc[c] - acc[n + c]) - racc[c] - cz[c];
     }
 
     // ---- solutions ------------------------------------------------------------------------------------------------
@@ -423,19 +435,19 @@ struct BandedIpm {
     template <class AfterFn>
     void backward(bool zero_rhs, V* out, double* zout, AfterFn after) {
         const I nn = I(n) * n;
-        const int q = n + pc;
-        for (int c = 0; c < pc; c++) zout[c] = kz[c];
-        ldl_solve(Dim<0>(pc), Dim<1>(), KL, Kinv, zout);
+        const int q = n + p;
+        for (int c = 0; c < p; c++) zout[c] = kz[c];
+        ldl_solve(Dim<0>(p), Dim<1>(), KL, Kinv, zout);
         if (zero_rhs)
             for (int k = 0; k < P * n; k++) rf[k] = 0.0;
-        chain_backward(n, P, pc, rM, rO, rZ, rf, zout, rx);
+        chain_backward(n, P, p, rM, rO, rZ, rf, zout, rx);
         V* last = out + (H - 1) * n;
         for (int k = 0; k < n; k++) {
             for (int t = 0; t < P; t++) last[k].set(t, rx[t * n + k]);
             left[k] = from_before(last[k]);
             lz[k] = left[k];
         }
-        for (int c = 0; c < pc; c++) lz[n + c] = dzv[c] = V(zout[c]);
+        for (int c = 0; c < p; c++) lz[n + c] = dzv[c] = V(zout[c]);
         for (I i = H - 2; i >= 0; i--) {
             V* xi = out + i * n;
             chain_back(n, q, L + i * nn, Z + i * zq, zero_rhs ? nullptr : f + i * n, lz,
@@ -582,7 +594,7 @@ struct BandedIpm {
 
     void least_squares() {
         reg = 1e-8;
-        pc = p0;
+        for (int k = 0; k < 2 * p; k++) zw[k] = 1.0, zl[k] = 0.0;
         assemble(0, 0, false, false);
         forward([&](I i, int j, V& nu_, V&) { nu_ = j < rows ? -b[i * rows + j] : V(0.0); });
         backward(false, dx, dz, [](I, const V*, const V*) {});
@@ -593,7 +605,6 @@ struct BandedIpm {
             backward(false, dx, dz, [](I, const V*, const V*) {});
             recentre();
         }
-        pc = p;
     }
 
     double largest_residual() const {
@@ -617,52 +628,23 @@ struct BandedIpm {
                 V d(0.0);
                 if (boxed) {
                     const V lo = xlo[i * n + k] - xref[i * n + k], hi = xhi[i * n + k] - xref[i * n + k];
-                    for (int t = 0; t < P; t++) d.set(t, inside(lo[t], hi[t], 0.0));
+                    for (int t = 0; t < P; t++) d.set(t, inside(lo[t], hi[t], 0.0, 0.05));
                 }
                 dx[i * n + k] = d;
             }
         }
         const double biggest = data_scale();
-        for (int c = 0; c < p0; c++) dz[c] = zhi[c] == zlo[c] ? 0.0 : inside(zlo[c] - zref[c], zhi[c] - zref[c], 0.0);
+        for (int c = 0; c < p0; c++) dz[c] = zhi[c] == zlo[c] ? 0.0 : inside(zlo[c] - zref[c], zhi[c] - zref[c], 0.0, 0.05);
         for (int c = 0; c < p0; c++) z[c] = 0.0;
         if (boxed || p0) recentre();
-        V top(0.0);
-        for (int j = 0; j < rows; j++) {
-            V mx(0.0), nr(0.0);
-            for (I i = 0; i < H; i++) {
-                mx = larger(mx, magnitude(b[i * rows + j]));
-                nr += l[i * pw + 2 * j];
-            }
-            hmax[j] = max_lanes(mx);
-            count[j] = 2.0 * sum_lanes(nr);
-            top = larger(top, mx);
-        }
-        S = max_lanes(top);
-        objective = comp = 0.0;
-        if (!(S > 1e-12 * biggest) || S < 1e-290) return false;
-        const V over(1.0 / S);
-        for (I i = 0; i < H; i++) {
-            for (int j = 0; j < rows; j++) b[i * rows + j] *= over;
-            for (int k = 0; k < n; k++) x[i * n + k] = V(0.0);
-        }
-        for (int c = 0; c < p; c++) {
-            zlo[c] = zlo[c] <= -lp_inf ? -2 * lp_inf : (zlo[c] - zref[c]) / S;
-            zhi[c] = zhi[c] >= lp_inf ? 2 * lp_inf : (zhi[c] - zref[c]) / S;
-        }
+        if (!unit_of_residuals(biggest)) return false;
         for (int c = 0; c < ns; c++) {
-            double top_c = 0.0, n_c = 0.0;
-            for (int j = 0; j < rows; j++)
-                if (lp.group[j] == c) top_c = max2(top_c, hmax[j] / S), n_c += count[j];
-            if (n_c == 0.0) {  // bounds no row: it stays on its floor and is no part of the path
-                z[p0 + c] = zhi[p0 + c] = zlo[p0 + c];
-                continue;
-            }
-            double s = 1.2 * top_c + 1e-3;
-            s = max2(s, zlo[p0 + c] + 1e-3);
-            z[p0 + c] = s;
-            kz[p0 + c] = max2(cz[p0 + c], soft ? 0.1 : 1e-2) / (2.0 * max2(n_c, 1.0));  // multiplier of a row
+            double top_c, n_c;
+            if (!rows_of(c, top_c, n_c)) continue;
+            z[p0 + c] = max2(1.2 * top_c + 1e-3, zlo[p0 + c] + 1e-3);
+            kz[p0 + c] = max2(cz[p0 + c], soft ? 0.1 : 1e-2) / (2.0 * n_c);  // multiplier of a row
         }
-        V sum(0.0), pairs(0.0);
+        V sum(0.0);
         for (I i = 0; i < H; i++)
             for (int j = 0; j < rows; j++) {
                 const double s = z[p0 + lp.group[j]], lam = kz[p0 + lp.group[j]];
@@ -681,47 +663,211 @@ struct BandedIpm {
                 wi[1] = where_positive(on, ws + rj, V(1.0));
                 li[0] = li[1] = where_positive(on, V(lam), V(0.0));
                 sum += wi[0] * li[0] + wi[1] * li[1];
-                pairs += where_positive(on, V(2.0), V(0.0));
             }
-        mu_pairs = sum_lanes(pairs);
-        const double mu = mu_pairs > 0 ? sum_lanes(sum) / mu_pairs : 1e-3;
+        open_bounds(mu_pairs > 0 ? sum_lanes(sum) / mu_pairs : 1e-3, nullptr);
+        return true;
+    }
+
+    // Measure everything in units S of the largest residual; false if all of them are rounding of `biggest`.
+    bool unit_of_residuals(double biggest) {
+        V top(0.0);
+        for (int j = 0; j < rows; j++) {
+            V mx(0.0), nr(0.0);
+            for (I i = 0; i < H; i++) {
+                mx = larger(mx, magnitude(b[i * rows + j]));
+                nr += l[i * pw + 2 * j];
+            }
+            hmax[j] = max_lanes(mx);
+            count[j] = 2.0 * sum_lanes(nr);
+            top = larger(top, mx);
+        }
+        S = max_lanes(top);
+        objective = comp = 0.0;
+        if (!(S > 1e-12 * biggest) || S < 1e-290) return false;
+        rounding = 4e-15 * biggest / S;
+        const V over(1.0 / S);
+        for (I i = 0; i < H; i++) {
+            for (int j = 0; j < rows; j++) b[i * rows + j] *= over;
+            for (int k = 0; k < n; k++) x[i * n + k] = V(0.0);
+        }
+        for (int c = 0; c < p; c++) {
+            zlo[c] = zlo[c] <= -lp_inf ? -2 * lp_inf : (zlo[c] - zref[c]) / S;
+            zhi[c] = zhi[c] >= lp_inf ? 2 * lp_inf : (zhi[c] - zref[c]) / S;
+        }
+        mu_pairs = 0.0;
+        for (int j = 0; j < rows; j++) mu_pairs += 2.0 * count[j];
+        reg = 1e-9 / (lp.T + 1.0);
+        return true;
+    }
+
+    // Largest residual and number of the rows that half-width c bounds; without any it stays on its floor and is no part
+    // of the path.
+    bool rows_of(int c, double& top, double& number) {
+        top = number = 0.0;
+        for (int j = 0; j < rows; j++)
+            if (lp.group[j] == c) top = max2(top, hmax[j] / S), number += count[j];
+        if (number == 0.0) z[p0 + c] = zhi[p0 + c] = zlo[p0 + c];
+        return number > 0.0;
+    }
+
+    // Pairs of the bounds of x, theta and s, with products mu or the multipliers of `from`.
+    void open_bounds(double mu, const LpWarm* from) {
         if (soft) mu_pairs *= 1.5;
         if (boxed)
             for (I i = 0; i < H; i++)
                 for (int k = 0; k < n; k++)
                     for (int t = 0; t < P; t++) {
-                        const double r = xref[i * n + k][t], lo = xlo[i * n + k][t], hi = xhi[i * n + k][t];
+                        const double at = xref[i * n + k][t], lo = xlo[i * n + k][t], hi = xhi[i * n + k][t];
                         V *wi = w + i * pw + 2 * (rows + k), *li = l + i * pw + 2 * (rows + k);
-                        if (hi < lp_inf) wi[0].set(t, (hi - r) / S), li[0].set(t, mu / wi[0][t]), mu_pairs += 1;
-                        if (lo > -lp_inf) wi[1].set(t, (r - lo) / S), li[1].set(t, mu / wi[1][t]), mu_pairs += 1;
+                        const I old = from ? state_of(t, i) + from->drop : 0;
+                        for (int side = 0; side < 2; side++) {
+                            if (side ? lo <= -lp_inf : hi >= lp_inf) continue;
+                            const double room = (side ? at - lo : hi - at) / S;
+                            double lam = mu / room;
+                            if (from && old <= from->T) {
+                                const double had = from->box[(old * n + k) * 2 + side] * sx[k];
+                                lam = had > 0.0 ? had : lam;
+                            }
+                            wi[side].set(t, room);
+                            li[side].set(t, lam);
+                            mu_pairs += 1;
+                        }
                     }
         capped = false;
         for (int c = 0; c < p; c++) {
             for (int k = 2 * c; k < 2 * c + 2; k++) zw[k] = 1.0, zl[k] = zu[k] = zv[k] = zrp[k] = 0.0;
             if (zhi[c] == zlo[c]) continue;
-            if (zlo[c] > -lp_inf) zw[2 * c] = z[c] - zlo[c], zl[2 * c] = mu / zw[2 * c], mu_pairs += 1;
-            if (zhi[c] < lp_inf) {
-                const double room = zhi[c] - z[c], need = c < p0 ? 0.0 : 0.1 * z[c];
-                zw[2 * c + 1] = max2(room, need);
-                zrp[2 * c + 1] = room - zw[2 * c + 1];
-                zl[2 * c + 1] = mu / zw[2 * c + 1];
+            for (int side = 0; side < 2; side++) {
+                const int k = 2 * c + side;
+                if (side ? zhi[c] >= lp_inf : zlo[c] <= -lp_inf) continue;
+                const double room = side ? zhi[c] - z[c] : z[c] - zlo[c];
+                zw[k] = max2(room, side && c >= p0 ? 0.1 * z[c] : 0.0);
+                zrp[k] = room - zw[k];
+                zl[k] = mu / zw[k];
+                if (from && from->ends[k] > 0.0) zl[k] = from->ends[k] * sz[c];
                 mu_pairs += 1;
-                capped = capped || c >= p0;
+                capped = capped || (side && c >= p0);
             }
         }
-        reg = 1e-9 / (lp.T + 1.0);
+    }
+
+    // ---- from the window before -----------------------------------------------------------------------------------
+
+    // The states of `from`, moved to where this problem has them; newer ones follow the model.
+    void recall(const LpWarm& from) {
+        double *last = rx, *next = rw;
+        for (I k = 0; k <= lp.T; k++) {
+            const I old = k + from.drop;
+            if (old <= from.T) {
+                for (int j = 0; j < n; j++) last[j] = from.x[old * n + j];
+            } else {
+                const double *Ek = unit_E ? nullptr : lp.E + (k - 1) * dE, *Ak = lp.A + (k - 1) * dA;
+                for (int j = n - 1; j >= 0; j--) {
+                    double s = lp.bx[(k - 1) * n + j];
+                    for (int c = 0; c < n; c++) s += Ak[j * n + c] * last[c];
+                    for (int c = 0; c < p0; c++) s -= lp.G[((k - 1) * rows + j) * p0 + c] * from.theta[c];
+                    if (!unit_E)
+                        for (int c = j + 1; c < n; c++) s -= Ek[j * n + c] * next[c];
+                    next[j] = s;
+                }
+                for (int j = 0; j < n; j++) last[j] = next[j];
+            }
+            const I i = k % H;
+            const int lane = int(k / H);
+            for (int j = 0; j < n; j++) {
+                if (base[i * n + j][lane] > 0.5) continue;  // does not move
+                double at = last[j] / sx[j];
+                if (boxed) at = inside(xlo[i * n + j][lane], xhi[i * n + j][lane], at, old <= from.T ? 1e-9 : 1e-3);
+                dx[i * n + j].set(lane, at);
+            }
+        }
+        for (int c = 0; c < p0; c++) {
+            zref[c] = 0.0;
+            dz[c] = zhi[c] == zlo[c] ? zlo[c] : inside(zlo[c], zhi[c], from.theta[c] / sz[c], 1e-9);
+        }
+        recentre();
+    }
+
+    // Start from `from` instead of least squares; false where that is no start.
+    bool warm_start(const LpWarm& from) {
+        if (!boxed)
+            for (I k = 0; k < I(H) * n; k++) dx[k] = V(0.0);
+        recall(from);
+        if (!unit_of_residuals(data_scale())) return false;
+        for (int c = 0; c < p; c++) z[c] = 0.0;
+        for (int c = 0; c < ns; c++) {
+            double top_c, n_c;
+            if (rows_of(c, top_c, n_c)) z[p0 + c] = max2(max2(from.s[c] / (sz[p0 + c] * S), (1 + 1e-9) * top_c), zlo[p0 + c] + 1e-6);
+        }
+        for (I k = max2(I(1), from.T - from.drop + 1); k <= lp.T; k++)  // room for the new rows
+            for (int j = 0; j < rows; j++) {
+                double& zj = z[p0 + lp.group[j]];
+                zj = max2(zj, 1.2 * std::fabs(b[k % H * rows + j][k / H]) + 1e-3);
+            }
+        double sum = 0.0, known = 0.0;
+        for (I i = 0; i < H; i++)
+            for (int j = 0; j < rows; j++) {
+                V *wi = w + i * pw + 2 * j, *li = l + i * pw + 2 * j;
+                const V on = li[0], rj = -b[i * rows + j], s(z[p0 + lp.group[j]]);
+                wi[0] = where_positive(on, s - rj, V(1.0));
+                wi[1] = where_positive(on, s + rj, V(1.0));
+                for (int t = 0; t < P; t++) {
+                    const I old = state_of(t, i) - 1 + from.drop;
+                    for (int side = 0; side < 2; side++) {
+                        const double had = on[t] > 0.0 && old < from.T ? from.lam[(old * rows + j) * 2 + side] / kappa[j] : 0.0;
+                        li[side].set(t, had);
+                        if (had > 0.0) sum += had * wi[side][t], known += 1.0;
+                    }
+                }
+            }
+        if (!(known > 0.0)) return false;
+        const double mu = sum / known;
+        for (I i = 0; i < H; i++)
+            for (int j = 0; j < rows; j++) {
+                V *wi = w + i * pw + 2 * j, *li = l + i * pw + 2 * j;
+                for (int t = 0; t < P; t++) {
+                    const I k = state_of(t, i);
+                    if (k < 1 || k > lp.T || (j >= n && !lp.seen[(k - 1) * m + j - n])) continue;
+                    for (int side = 0; side < 2; side++)
+                        if (!(li[side][t] > 0.0)) li[side].set(t, mu / wi[side][t]);
+                }
+            }
+        open_bounds(mu, &from);
         return true;
     }
 
-    // where to start between two bounds: at a, at least 5 % of the width (or of 1) away from either
-    static inline double inside(double lo, double hi, double a) {
+    // What the next window starts from.
+    void hand_on(LpWarm& to) const {
+        to.T = lp.T;
+        to.drop = 0;
+        for (int c = 0; c < p0; c++) to.theta[c] = sz[c] * (zref[c] + S * zwarm[c]);
+        for (int c = 0; c < ns; c++) to.s[c] = sz[p0 + c] * S * zwarm[p0 + c];
+        for (int c = 0; c < p; c++)
+            for (int side = 0; side < 2; side++) to.ends[2 * c + side] = zlwarm[2 * c + side] / sz[c];
+        for (int lane = 0; lane < P; lane++)
+            for (I i = 0; i < H; i++) {
+                const I k = state_of(lane, i);
+                if (k > lp.T) continue;
+                for (int j = 0; j < n; j++) {
+                    to.x[k * n + j] = sx[j] * (xref[i * n + j][lane] + S * xwarm[i * n + j][lane]);
+                    for (int side = 0; side < 2; side++)
+                        to.box[(k * n + j) * 2 + side] = boxed ? lwarm[i * pw + 2 * (rows + j) + side][lane] / sx[j] : 0.0;
+                }
+                for (int j = 0; j < rows && k > 0; j++)
+                    for (int side = 0; side < 2; side++)
+                        to.lam[((k - 1) * rows + j) * 2 + side] = lwarm[i * pw + 2 * j + side][lane] * kappa[j];
+            }
+    }
+
+    // where to start between two bounds: at a, at least a share `rim` of the width (or of 1) away from either
+    static inline double inside(double lo, double hi, double a, double rim) {
         const bool low = lo > -lp_inf, high = hi < lp_inf;
         if (low && high) {
-            const double edge = 0.05 * (hi - lo);
+            const double edge = rim * (hi - lo);
             return max2(lo + edge, min2(hi - edge, a));
         }
-        if (low) return max2(lo + 0.05 * min2(1.0, 1.0 + std::fabs(lo)), a);
-        if (high) return min2(hi - 0.05 * min2(1.0, 1.0 + std::fabs(hi)), a);
+        if (low) return max2(lo + rim * min2(1.0, 1.0 + std::fabs(lo)), a);
+        if (high) return min2(hi - rim * min2(1.0, 1.0 + std::fabs(hi)), a);
         return a;
     }
 
@@ -754,81 +900,97 @@ struct BandedIpm {
     }
     bool certificate = false;
 
-    // dense part of the right-hand side for target products sigma mu (0 for the affine direction)
-    void dense_rhs(double target, bool corrected) {
-        for (int c = 0; c < p; c++)
-            for (int side = 0; side < 2; side++) {
-                const int k = 2 * c + side;
-                if (!(zl[k] > 0)) continue;
-                const double pa = corrected ? zw[k] * zl[k] * zu[k] * zv[k] : 0.0;
-                const double zeta = (target - pa) / zw[k], d = zl[k] / zw[k];
-                kz[c] += (side ? -1.0 : 1.0) * (zeta - d * zrp[k]);
-            }
+    // A direction (u, v) = (dw / w, dl / l) of a pair solves u + v = e - 1: e = 0 is the affine direction, and what is
+    // asked beyond it goes into the right-hand side as l e.
+    void dense_rhs() {
+        for (int k = 0; k < 2 * p; k++)
+            if (zl[k] > 0) kz[k / 2] += (k & 1 ? -1.0 : 1.0) * zl[k] * (ze[k] - zrp[k] / zw[k]);
     }
 
-    // relative steps of the dense pairs along dz
-    void dense_steps(double target, bool corrected, double& block_p, double& block_d) {
-        for (int c = 0; c < p; c++)
-            for (int side = 0; side < 2; side++) {
-                const int k = 2 * c + side;
-                if (!(zl[k] > 0)) continue;
-                const double pa = corrected ? zu[k] * zv[k] : 0.0;
-                zu[k] = ((side ? -dz[c] : dz[c]) + zrp[k]) / zw[k];
-                zv[k] = -1.0 - zu[k] - pa + target / (zw[k] * zl[k]);
-                block_p = max2(block_p, -zu[k]);
-                block_d = max2(block_d, -zv[k]);
-            }
-    }
-
-    // the slack's own step at row j: de = (r - Wd ds - Sd drho) / (Wd + de)
-    inline V slack_step(const V* wi, const V* li, int j, const V& r, const V& ds, const V& drho, V& Wd, V& Sd, V& den) const {
-        const V dp = li[2 * j] / wi[2 * j], dm = li[2 * j + 1] / wi[2 * j + 1], de = li[2 * G + j] / wi[2 * G + j];
-        Wd = dp + dm;
-        Sd = dm - dp;
-        den = V(1.0) / larger(Wd + de, V(1e-300));
-        return (r - Wd * ds - Sd * drho) * den;
-    }
-
-    // zeta = (target - dw dl) / w of a pair entry, from the affine step kept in u
-    inline V zeta(const V& w_, const V& l_, const V& u_, const V& target) const {
-        return where_positive(l_, target / w_ + l_ * u_ * (V(1.0) + u_), V(0.0));
-    }
-
-    void affine(double& ap, double& ad, double& mu_affine) {
-        if (soft) {
-            forward([&](I i, int j, V& nu_, V& t) {
-                nu_ = V(0.0);
-                if (j >= rows) return;
-                const V *wi = w + i * pw, *li = l + i * pw;
-                V Wd, Sd, den;
-                slack_step(wi, li, j, V(0.0), V(0.0), V(0.0), Wd, Sd, den);
-                const V r = where_positive(li[2 * G + j], V(-lp.slack[j] / kappa[j]), V(0.0));
-                nu_ = Sd * r * den;
-                t = -Wd * r * den;
-            });
-        } else {
-            for (int c = 0; c < p; c++) kz[c] = -cz[c];
+    void dense_steps(double& block_p, double& block_d) {
+        for (int k = 0; k < 2 * p; k++) {
+            if (!(zl[k] > 0)) continue;
+            zu[k] = ((k & 1 ? -dz[k / 2] : dz[k / 2]) + zrp[k]) / zw[k];
+            zv[k] = ze[k] - 1.0 - zu[k];
+            block_p = max2(block_p, -zu[k]);
+            block_d = max2(block_d, -zv[k]);
         }
-        dense_rhs(0.0, false);
-        V block_p(0.0), block_d(0.0), Su(0.0), Suu(0.0);
-        backward(!soft, dx, dz, [&](I i, const V* xi, const V* xb) {
-            V *wi = w + i * pw, *li = l + i * pw, *ui = u + i * pw;
+    }
+
+    // the slack's own step at row j: de = (t - Wd ds - Sd drho) / (Wd + de)
+    inline V slack_step(const V* wi, const V* li, int j, const V& t, const V& ds, const V& drho) const {
+        V Wd, Sd, de;
+        slopes(wi, li, j, Wd, Sd, de);
+        return (t - Wd * ds - Sd * drho) * (V(1.0) / larger(Wd + de, V(1e-300)));
+    }
+
+    // what is asked of the slack at row j: its cost, and e of the pair and of itself
+    inline V slack_rhs(const V* li, int j, const V& asked) const {
+        const int k = 2 * G + j;
+        return where_positive(li[k], asked - V(lp.slack[j] / kappa[j]), V(0.0));
+    }
+
+    // The right-hand side of a direction, e(i, k) of every pair entry.
+    template <class AskFn>
+    void ask(AskFn e) {
+        forward([&](I i, int j, V& nu_, V& t) {
+            const V *wi = w + i * pw, *li = l + i * pw;
+            const V zp = li[2 * j] * e(i, 2 * j), zm = li[2 * j + 1] * e(i, 2 * j + 1);
+            nu_ = zp - zm;
+            t = zp + zm;
+            if (soft && j < rows) {
+                V Wd, Sd, de;
+                slopes(wi, li, j, Wd, Sd, de);
+                const V own_ = slack_rhs(li, j, t + li[2 * G + j] * e(i, 2 * G + j)) * (V(1.0) / larger(Wd + de, V(1e-300)));
+                nu_ += Sd * own_;
+                t -= Wd * own_;
+            }
+        });
+        dense_rhs();
+    }
+
+    // Solve for the direction: take(i, k, dw) is called for every pair entry.
+    template <class AskFn, class TakeFn>
+    void answer(bool zero_rhs, AskFn e, TakeFn take) {
+        backward(zero_rhs, dx, dz, [&](I i, const V* xi, const V* xb) {
+            const V *wi = w + i * pw, *li = l + i * pw;
             apply(i, xi, xb, p0 ? dzv : nullptr, rho);
             for (int j = 0; j < G; j++) {
                 V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
                 if (soft && j < rows) {
-                    V Wd, Sd, den;
-                    const V r = where_positive(li[2 * G + j], V(-lp.slack[j] / kappa[j]), V(0.0));
-                    const V de = slack_step(wi, li, j, r, ds, rho[j], Wd, Sd, den);
-                    note_affine(de, wi[2 * G + j], li[2 * G + j], ui[2 * G + j], block_p, block_d, Su, Suu);
+                    const V asked = li[2 * j] * e(i, 2 * j) + li[2 * j + 1] * e(i, 2 * j + 1) + li[2 * G + j] * e(i, 2 * G + j);
+                    const V de = slack_step(wi, li, j, slack_rhs(li, j, asked), ds, rho[j]);
+                    take(i, 2 * G + j, de);
                     ds += de;
                 }
-                note_affine(ds - rho[j], wi[2 * j], li[2 * j], ui[2 * j], block_p, block_d, Su, Suu);
-                note_affine(ds + rho[j], wi[2 * j + 1], li[2 * j + 1], ui[2 * j + 1], block_p, block_d, Su, Suu);
+                take(i, 2 * j, ds - rho[j]);
+                take(i, 2 * j + 1, ds + rho[j]);
             }
         });
+    }
+
+    // the direction that ignores centring, how far it may be followed, and the mean product there
+    void affine(double& ap, double& ad, double& mu_affine) {
+        auto none = [](I, I) { return V(0.0); };
+        for (int k = 0; k < 2 * p; k++) ze[k] = 0.0;
+        if (soft) {
+            ask(none);
+        } else {
+            for (int c = 0; c < p; c++) kz[c] = -cz[c];
+            dense_rhs();
+        }
+        V block_p(0.0), block_d(0.0), Su(0.0), Suu(0.0);
+        answer(!soft, none, [&](I i, I k_, const V& dw) {
+            const I k = i * pw + k_;
+            const V a = where_positive(l[k], dw / w[k], V(0.0)), wl = w[k] * l[k];
+            u[k] = a;
+            block_p = larger(block_p, -a);
+            block_d = larger(block_d, where_positive(l[k], V(1.0) + a, V(0.0)));
+            Su += wl * a;
+            Suu += wl * a * a;
+        });
         double bp = max_lanes(block_p), bd = max_lanes(block_d);
-        dense_steps(0.0, false, bp, bd);
+        dense_steps(bp, bd);
         ap = min2(1.0, 1.0 / max2(bp, 1e-300));
         ad = min2(1.0, 1.0 / max2(bd, 1e-300));
         // sum (w + ap dw)(l + ad dl) without another sweep: v = -1 - u, so only sums of u and u^2 are needed
@@ -840,68 +1002,32 @@ struct BandedIpm {
         mu_affine = (s0 + ap * su - ad * (s0 + su) - ap * ad * (su + suu) + dense) / mu_pairs;
     }
 
-    inline void note_affine(const V& dw, const V& w_, const V& l_, V& u_, V& bp, V& bd, V& Su, V& Suu) const {
-        const V r = where_positive(l_, dw / w_, V(0.0)), wl = w_ * l_;
-        u_ = r;
-        bp = larger(bp, -r);
-        bd = larger(bd, where_positive(l_, V(1.0) + r, V(0.0)));
-        Su += wl * r;
-        Suu += wl * r * r;
-    }
-
-    void corrected(double target_, double& block_p_, double& block_d_) {
-        const V target(target_);
-        forward([&](I i, int j, V& nu_, V& t) {
-            const V *wi = w + i * pw, *li = l + i * pw, *ui = u + i * pw;
-            const V zp = zeta(wi[2 * j], li[2 * j], ui[2 * j], target);
-            const V zm = zeta(wi[2 * j + 1], li[2 * j + 1], ui[2 * j + 1], target);
-            nu_ = zp - zm;
-            t = zp + zm;
-            if (soft && j < rows) {
-                V Wd, Sd, den;
-                slack_step(wi, li, j, V(0.0), V(0.0), V(0.0), Wd, Sd, den);
-                const V r = slack_rhs(wi, li, ui, j, zp + zm, target) * den;
-                nu_ += Sd * r;
-                t -= Wd * r;
-            }
-        });
-        dense_rhs(target_, true);
+    // (u, v) of the e that `v` and `ze` hold
+    void direction(double& block_p_, double& block_d_) {
         V block_p(0.0), block_d(0.0);
-        backward(false, dx, dz, [&](I i, const V* xi, const V* xb) {
-            V *wi = w + i * pw, *li = l + i * pw, *ui = u + i * pw, *vi = v + i * pw;
-            apply(i, xi, xb, p0 ? dzv : nullptr, rho);
-            for (int j = 0; j < G; j++) {
-                V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
-                if (soft && j < rows) {
-                    V Wd, Sd, den;
-                    const V zs = zeta(wi[2 * j], li[2 * j], ui[2 * j], target) +
-                                 zeta(wi[2 * j + 1], li[2 * j + 1], ui[2 * j + 1], target);
-                    const V de = slack_step(wi, li, j, slack_rhs(wi, li, ui, j, zs, target), ds, rho[j], Wd, Sd, den);
-                    note(de, wi[2 * G + j], li[2 * G + j], ui[2 * G + j], vi[2 * G + j], target, block_p, block_d);
-                    ds += de;
-                }
-                note(ds - rho[j], wi[2 * j], li[2 * j], ui[2 * j], vi[2 * j], target, block_p, block_d);
-                note(ds + rho[j], wi[2 * j + 1], li[2 * j + 1], ui[2 * j + 1], vi[2 * j + 1], target, block_p, block_d);
-            }
+        answer(false, [&](I i, I k) { return v[i * pw + k]; }, [&](I i, I k_, const V& dw) {
+            const I k = i * pw + k_;
+            const V un = where_positive(l[k], dw / w[k], V(0.0)), vn = where_positive(l[k], v[k] - V(1.0) - un, V(0.0));
+            u[k] = un;
+            v[k] = vn;
+            block_p = larger(block_p, -un);
+            block_d = larger(block_d, -vn);
         });
         block_p_ = max_lanes(block_p);
         block_d_ = max_lanes(block_d);
-        dense_steps(target_, true, block_p_, block_d_);
+        dense_steps(block_p_, block_d_);
     }
 
-    inline V slack_rhs(const V* wi, const V* li, const V* ui, int j, const V& zs, const V& target) const {
-        const int k = 2 * G + j;
-        return where_positive(li[k], zs + zeta(wi[k], li[k], ui[k], target) - V(lp.slack[j] / kappa[j]), V(0.0));
-    }
-
-    inline void note(const V& dw, const V& w_, const V& l_, V& u_, V& v_, const V& target, V& bp, V& bd) const {
-        const V ls = where_positive(l_, l_, V(1.0)), r = V(1.0) / (w_ * ls), ua = u_;
-        const V un = where_positive(l_, dw * ls * r, V(0.0));
-        const V vn = where_positive(l_, target * r - V(1.0) - un + ua * (V(1.0) + ua), V(0.0));
-        u_ = un;
-        v_ = vn;
-        bp = larger(bp, -un);
-        bd = larger(bd, -vn);
+    // products of `target` in every pair, less the affine direction's own product dw dl
+    void corrected(double target_, double& block_p, double& block_d) {
+        const V target(target_);
+        for (int k = 0; k < 2 * p; k++)
+            if (zl[k] > 0) ze[k] = target_ / (zw[k] * zl[k]) - zu[k] * zv[k];
+        ask([&](I i, I k_) {
+            const I k = i * pw + k_;
+            return v[k] = share(target, w[k], l[k]) + u[k] * (V(1.0) + u[k]);
+        });
+        direction(block_p, block_d);
     }
 
     // After a full step the dual equations should hold; what is missing is solved for by conjugate gradients on the
@@ -963,8 +1089,7 @@ struct BandedIpm {
             for (int j = 0; j < G; j++) {
                 V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
                 if (soft && j < rows) {
-                    V Wd, Sd, den;
-                    const V de = slack_step(wi, li, j, V(0.0), ds, rho[j], Wd, Sd, den);
+                    const V de = slack_step(wi, li, j, V(0.0), ds, rho[j]);
                     take(de, 2 * G + j);
                     ds += de;
                 }
@@ -1018,6 +1143,15 @@ struct BandedIpm {
     int solve(LpOut& out) {
         LpInfo& info = out.info;
         info = LpInfo{0, 0, 0, 0, 0, 0, 0, lp_stalled};
+        LpWarm* warm = set.warm && set.point == lp_optimal && !soft ? out.warm : nullptr;
+        int before = 0;
+        // Where more than an eighth of the rows are new, a cold start is as near.
+        if (warm && 8 * (lp.T - warm->T + warm->drop) <= lp.T && warm->drop <= warm->T / 8) {
+            pack();
+            if (warm_start(*warm) && follow(out, warm) == lp_ok) return lp_ok;
+            before = info.iterations;
+        }
+        if (warm) warm->T = 0;
         pack();
         for (int c = 0; c < p; c++) z[c] = dz[c] = 0.0;
         if (boxed) {
@@ -1030,24 +1164,36 @@ struct BandedIpm {
         }
         least_squares();
         const bool worth = start();
-        info.scale = S;
         if (!worth || set.point == lp_least_squares) {
             for (I k = 0; k < I(H) * n; k++) x[k] = V(0.0);
             for (int c = 0; c < p; c++) z[c] = 0.0;
+            info.scale = S;
             info.status = finish(out, x, l, z, true);
-            return info.status;
+        } else {
+            follow(out, warm);
         }
+        info.iterations += before;
+        return info.status;
+    }
+
+    // the path from where `start` or `warm_start` has put the iterate
+    int follow(LpOut& out, LpWarm* warm) {
+        LpInfo& info = out.info;
+        info.scale = S;
+        bool saved = false;
         double best = 1e300, ap = 0, ad = 0, free_cost = 1.0;
         for (int c = 0; c < p; c++) free_cost = cz[c] > 0 ? 0.0 : free_cost;
         int since = 0, it = 0;
+        double promised = 1e300, last = 1e300;
         bool kept = false, step = false;
-        double mu0 = 0.0;
         for (;; it++) {
             if (step) dense_take(ap, ad);
             assemble(ap, ad, step, true);
             step = true;
-            const double size = std::fabs(objective) + 1e-6 + free_cost;
-            const double gap = comp / size, merit = max2(gap, max2(dinf / size, pinf / size));
+            const double size = std::fabs(objective) + 1e-6 + free_cost + (set.point == lp_central ? 0.0 : rounding / set.tol);
+            const double slip = (dinf - promised) / size;  // what the last direction's dual residual lacks
+            const double gap = comp / size, worst = max2(gap, max2(dinf / size, pinf / size));
+            const double merit = comp + dinf + pinf < 1e300 ? worst : 1e300;  // NaN is no merit
             info.iterations = it;
             if (merit < best) {
                 best = merit;
@@ -1069,6 +1215,13 @@ struct BandedIpm {
                 info.status = finish(out, x, l, z, false);
                 return info.status;
             }
+            if (warm && !saved && it >= 2 && merit <= lp_warm_gap) {
+                for (I k = 0; k < I(H) * n; k++) xwarm[k] = x[k];
+                for (I k = 0; k < I(H) * pw; k++) lwarm[k] = l[k];
+                for (int c = 0; c < p; c++) zwarm[c] = z[c];
+                for (int k = 0; k < 2 * p; k++) zlwarm[k] = zl[k];
+                saved = true;
+            }
             if (merit <= set.tol) break;
             if (certificate) {
                 info.status = lp_infeasible;
@@ -1077,7 +1230,6 @@ struct BandedIpm {
             }
             if (it >= set.max_iter || !(merit < 1e4 * best || it < 10) || (since >= 8 && best < 1e-5) || since >= 30) break;
             const double mu = comp / mu_pairs;
-            if (it == 0) mu0 = mu;
             double mu_affine;
             affine(ap, ad, mu_affine);
             double sigma = mu_affine / mu;
@@ -1087,18 +1239,21 @@ struct BandedIpm {
             if (set.point == lp_central) sigma = max2(sigma, 0.2), fraction = 0.9;
             double bp, bd;
             corrected(sigma * mu, bp, bd);
-            const double need = dinf / size;
-            int steps = set.point == lp_central ? 0 : mu < 1e-7 * mu0 ? 2 : mu < 1e-4 * mu0 ? 1 : 0;
-            if (set.point != lp_central && need > set.tol && need > 0.1 * gap) steps += 2;
+// Refinement where the last direction was not accurate, or the path hardly went on.
+            const bool slipped = slip > set.tol && slip > 0.1 * gap, slow = merit > 0.5 * last && merit < 1e-2;
+            const int steps = set.point == lp_central ? 0 : slipped ? 3 : slow ? 2 : 0;
+            last = merit;
             refine(steps, bp, bd);
             ap = min2(1.0, fraction / max2(bp, 1e-300));
             ad = min2(1.0, fraction / max2(bd, 1e-300));
+            promised = (1.0 - ad) * dinf;
             if (!(bp - bp == 0.0) || !(bd - bd == 0.0)) break;
         }
-        const bool good = best <= 10.0 * set.tol, fair = best <= 1e-6;
+        const bool good = best <= max2(set.tol, 1e-8), fair = best <= 1e-6;
         info.status = good ? lp_ok : fair ? lp_reduced : lp_stalled;
         const int verdict = kept ? finish(out, xbest, lbest, zbest, false) : finish(out, x, l, z, false);
         if (verdict == lp_stalled) info.status = lp_stalled;
+        if (saved && info.status == lp_ok) hand_on(*warm);
         return info.status;
     }
 

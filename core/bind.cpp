@@ -11,10 +11,15 @@ void bind_nonlinear(nb::module_& m);
 void bind_loss(nb::module_& m);
 void bind_lp(nb::module_& m);
 void bind_chain(nb::module_& m);
+void bind_enclose(nb::module_& m);
+void bind_sets(nb::module_& m);
+void bind_box(nb::module_& m);
+void bind_hull(nb::module_& m);
 void bind_constrain(nb::module_& m);
 void bind_noise(nb::module_& m);
 void bind_ep(nb::module_& m);
 void bind_sampler(nb::module_& m);
+void bind_mixed(nb::module_& m);
 
 NB_MODULE(_core, m) {
     m.doc() = "Kernels of halfwidth: arrays in, arrays out, the papers' symbols.";
@@ -28,8 +33,13 @@ NB_MODULE(_core, m) {
     bind_loss(m);
     bind_lp(m);
     bind_chain(m);
+    bind_enclose(m);
+    bind_sets(m);
+    bind_box(m);
+    bind_hull(m);
     bind_constrain(m);
     bind_noise(m);
     bind_ep(m);
     bind_sampler(m);
+    bind_mixed(m);
 }

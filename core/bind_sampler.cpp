@@ -34,7 +34,7 @@ void expect(bool fits) {
 }
 
 nb::tuple sampler_run(Whole start, Whole column, Reals value, Reals b, Whole place, Whole first, Whole state, Reals weight,
-                      Whole count, Reals ends, Reals prior, Reals box, Whole column_start, Whole column_at,
+                      Whole count, Reals ends, Reals prior, double power, Reals box, Whole column_start, Whole column_at,
                       Whole column_place, Reals x0, Reals s0, Whole theta_start,
                       Whole theta_row, Whole theta_at, Reals theta_slope, Reals theta_ends, Reals theta, long n, long band,
                       long scatter, long warm, long draws, long thin, long whitened, long scale_every, std::uint64_t seed) {
@@ -56,6 +56,7 @@ nb::tuple sampler_run(Whole start, Whole column, Reals value, Reals b, Whole pla
     a.weight = weight.data(), a.count = count.data();
     a.floor = ends.data(), a.cap = a.floor + p, a.tiny = a.cap + p;
     a.prior_mean = prior.data(), a.prior_sd = a.prior_mean + p;
+    a.power = power;
     a.lo = box.data(), a.hi = a.lo + N, a.x0 = x0.data(), a.s0 = s0.data();
     a.column_start = column_start.data(), a.column_at = column_at.data(), a.column_place = column_place.data();
     a.theta_start = theta_start.data(), a.theta_row = theta_row.data(), a.theta_at = theta_at.data();
@@ -82,7 +83,7 @@ nb::tuple sampler_run(Whole start, Whole column, Reals value, Reals b, Whole pla
 
 void bind_sampler(nb::module_& m) {
     m.def("sampler_run", &sampler_run, "start"_a, "column"_a, "value"_a, "b"_a, "place"_a, "first"_a, "state"_a, "weight"_a,
-          "count"_a, "ends"_a, "prior"_a, "box"_a, "column_start"_a, "column_at"_a, "column_place"_a, "x0"_a, "s0"_a, "theta_start"_a, "theta_row"_a, "theta_at"_a,
+          "count"_a, "ends"_a, "prior"_a, "power"_a, "box"_a, "column_start"_a, "column_at"_a, "column_place"_a, "x0"_a, "s0"_a, "theta_start"_a, "theta_row"_a, "theta_at"_a,
           "theta_slope"_a, "theta_ends"_a, "theta"_a, "n"_a, "band"_a, "scatter"_a, "warm"_a, "draws"_a, "thin"_a, "whitened"_a, "scale_every"_a, "seed"_a,
           "Draw one chain of trajectories, half-widths and unknown entries: (X, s, theta, code); see core/sampler_entry.hpp.");
 }

@@ -52,7 +52,7 @@ template <class V, class N>
 inline void unit_factor(N n, V* M, double drop, V* work) {
     for (int j = 0; j < n; j++) work[j] = V(drop) * M[j * n + j];
     for (int j = 0; j < n; j++) {
-        const V di = V(1.0) / larger(M[j * n + j], work[j]);
+        const V di = where_positive(M[j * n + j] - work[j], V(1.0) / M[j * n + j], V(0.0));
         M[j * n + j] = di;
         for (int i = j + 1; i < n; i++) {
             const V li = M[i * n + j] * di;

@@ -5,8 +5,9 @@ namespace hw {
 namespace HW_ISA {
 namespace {
 
-// f(Dim<nx>, Dim<ny>) with both sizes fixed for nx <= 8, ny <= 4; at run time otherwise. A sanitizer build, which takes
-// ten times longer to compile, has a few of the same templates.
+// f(Dim<nx>, Dim<ny>) with both sizes fixed for nx <= 8, ny <= 4, and for those that fill and calibrate a vehicle's
+// drive; at run time otherwise. A sanitizer build, which takes ten times longer to compile, has a few of the same
+// templates.
 template <int N, class F>
 inline void with_outputs(int ny, F f) {
     switch (ny) {
@@ -32,6 +33,13 @@ inline void with_sizes(int nx, int ny, F f) {
         case 6: return with_outputs<6>(ny, f);
         case 7: return with_outputs<7>(ny, f);
         case 8: return with_outputs<8>(ny, f);
+        case 9:  // the chain of a vehicle, and what calibrates its sensors
+            if (ny == 2) return f(Dim<9>(), Dim<2>());
+            if (ny == 3) return f(Dim<9>(), Dim<3>());
+            break;
+        case 11:  // the same with an antenna off the axle
+            if (ny == 3) return f(Dim<11>(), Dim<3>());
+            break;
 #endif
         default: break;
     }

@@ -35,8 +35,17 @@ struct LpSettings {
     double tol = 1e-9;       // relative gap asked of the optimal point
     double central_gap = 0.3;  // relative gap at which the central point stops
     int max_iter = 100;
-    bool warm = false;       // start from x, theta, s and lam as given
-    int refine = 2;          // most steps of iterative refinement
+    bool warm = false;       // LpOut::warm is in use
+};
+
+// A well-centred iterate of one problem, for the next to start from, in the caller's units. It is of T rows (0: there is
+// none yet), of which the next problem no longer has the first `drop`. Arrays hold as many rows as either problem.
+struct LpWarm {
+    int T, drop;
+    double *x, *theta, *s;  // (T+1, n), (p0), (ns)
+    double* lam;            // (T, n+m, 2) multipliers of the rows
+    double* box;            // (T+1, n, 2) of the states' upper and lower bounds
+    double* ends;           // (p0+ns, 2) of the lower and upper bounds of theta and s
 };
 
 struct LpInfo {
@@ -50,6 +59,7 @@ struct LpOut {
     double* s;      // (ns)
     double* lam;    // (T, n+m, 2) multipliers of s - rho >= 0 and s + rho >= 0, or null
     double* slack;  // (T, n+m) or null
+    LpWarm* warm;   // in: where to start, out: where the next may; or null
     LpInfo info;
 };
 
@@ -57,16 +67,20 @@ struct LpOut {
 struct LpWindows {
     LpProblem whole;     // of the whole record; x0_lo, x0_hi bound the state before its first row
     const int* start;    // (T) first row of each window
-    int memory;          // a state's interval is that of its estimates from the next `memory` windows
+    const int* last;     // (T+1) the interval of state k is that of its estimates by the windows that end at k-1..last[k]
+    const double* early;  // (early_rows, ns) costs of the first windows
+    int early_rows;
+    int memory;          // by how many windows more a finished interval is widened: n / (n - 2)
     double carry;        // kappa with which a finished interval bounds the state a window starts from; 0: not
     double* filtered;    // (T, n)  newest state of each window
     double* smoothed;    // (T+1, n)  last estimate of each state
     double* s;           // (T, ns)
-    double *low, *high;  // (T+1, n)  least and largest estimate of each state by the windows that end within `memory`
+    double *low, *high;  // (T+1, n)  least and largest estimate of each state by those windows
     int* status;         // (T)
     int* iterations;     // (T)
-    double* seconds;     // (T)
+    double* seconds;     // (T) CPU time
     double* scratch;     // (longest window + 1) n + 2 n
+    LpWarm* warm;        // of the longest window, if the settings ask for it
 };
 
 }  // namespace hw

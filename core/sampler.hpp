@@ -5,7 +5,7 @@
 // obeys |rho| <= s_j with the uniform density of that box; a row of group -1 is Gaussian with precision w. With M_j the
 // largest |rho| of the N_j rows of group j the conditional of a half-width is
 //
-//     p(s_j | X) ~ s_j^-N_j prior(s_j) on s_j >= M_j;     the prior is flat between floor and cap, or normal in log s.
+//     p(s_j | X) ~ s_j^-N_j prior(s_j) on s_j >= M_j;     the prior is s^(power - 1) between floor and cap, or normal in log s.
 //
 // Given s, X fills a polytope (under a Gaussian where rows are Gaussian), and every move along a line has a closed
 // draw: uniform, or normal between two ends.
@@ -36,7 +36,7 @@ inline std::uint64_t bits(std::uint64_t& state) {  // splitmix64
 }
 inline double uniform01(std::uint64_t& state) { return (static_cast<double>(bits(state) >> 11) + 0.5) * 0x1.0p-53; }
 
-// log of int exp(-k u) du from u = low to `length` above it: what a flat prior leaves of a half-width with k + 1 rows
+// log of int exp(-k u) du from u = low to `length` above it: what a prior s^(power - 1) leaves of N = k + power rows
 inline double log_exponential(double k, double low, double length) {
     if (length <= 0.0) return minus_inf;
     const double kl = k * length;
@@ -50,7 +50,7 @@ inline double log_mass(const SamplerArgs& a, long j, double cap, double largest)
     const double high = cap < __builtin_inf() ? std::log(cap) : 1e300;
     if (low > high) return minus_inf;
     const double N = static_cast<double>(a.count[j]), d = a.prior_sd[j];
-    if (!(d > 0.0)) return log_exponential(N - 1.0, low, high - low);
+    if (!(d > 0.0)) return log_exponential(N - a.power, low, high - low);
     const double m = a.prior_mean[j] - N * d * d;
     const Truncated4 t = truncated4(all4(m), all4(d * d), all4(low), all4(high));
     return t.log_z[0] - N * a.prior_mean[j] + 0.5 * N * N * d * d;
@@ -86,7 +86,7 @@ inline double draw_log_s(const SamplerArgs& a, long j, double cap, double larges
     if (!(low < high)) return low;
     const double N = static_cast<double>(a.count[j]), d = a.prior_sd[j];
     if (!(d > 0.0)) {
-        const double k = N - 1.0, kl = k * (high - low), u = uniform01(rng);
+        const double k = N - a.power, kl = k * (high - low), u = uniform01(rng);
         if (kl < 1e-8 && kl > -1e-8) return low + u * (high - low);
         return low - std::log1p(u * (kl > 700.0 ? -1.0 : std::expm1(-kl))) / k;
     }

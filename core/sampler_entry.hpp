@@ -19,7 +19,8 @@ struct SamplerArgs {
     const double* weight;                  // (R,) precision of Gaussian rows, by place
     const long* count;                     // (p,) rows of each group
     const double *floor, *cap, *tiny;      // (p,) of the half-widths; equal floor and cap: known
-    const double *prior_mean, *prior_sd;   // (p,) normal prior of log s; prior_sd 0: flat in s
+    const double *prior_mean, *prior_sd;   // (p,) normal prior of log s; prior_sd 0: s^(power - 1)
+    double power;
     const double *lo, *hi;                 // (N,) boxes
     const long *column_start, *column_at, *column_place;  // (N+1,), (nnz,): entries of each column of M: in `value`, row's place
     const double *x0, *s0;                 // (N,), (p,) start, inside boxes and caps

@@ -123,16 +123,19 @@ def _settings():
         "KalmanSmoother": [{"lag": 4}],
         "ExtendedKalman": [{"smooth": True}],
         "UnscentedKalman": [{"smooth": True}],
+        "Hull": [{"memory": 10}, {"memory": 5, "lag": 4}, {"lag": 0}],
         "Constrained": [
             {"by": "truncate", "feedback": True},
             {"by": "project", "method": hw.KalmanSmoother()},
             {"by": "nearest", "method": hw.GPB()},
             {"method": hw.UnscentedKalman(), "feedback": True},
         ],
+        "MixedFilter": [{"form": "ellipsoid", "gain": "set"}, {"form": "zonotope", "lag": 4}],
     }
+    quick = {"MixedWindow": {"memory": 2}}  # a small window: each row of a record with holes is a design of its own
     found = []
     for name in ESTIMATORS:
-        found.append(load(name)())
+        found.append(load(name)(**quick.get(name, {})))
         found += [load(name)(**extra) for extra in variants.get(name, [])]
     return found
 
@@ -152,3 +155,8 @@ def stochastic(method):
 def point_only(method):
     """Whether a method gives a point without a spread."""
     return type(method).__name__ in ("BatchLP", "SequentialLP", "Window")
+
+
+def weighs(method):
+    """Whether a method weighs the states up against each other at each row: one may widen while the others narrow."""
+    return type(method).__name__ in ("MixedFilter", "MixedWindow")

@@ -7,11 +7,12 @@ import sys
 import halfwidth as hw
 
 NAMES = """
-BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Box Cloud Comparison Constrained
-DataQualityWarning Estimate Estimator ExtendedKalman FearnheadClifford GPB Gaussian Halfspaces HalfwidthError KalmanFilter KalmanSmoother Learned Linear
-LogTooBig Markov MemoryChoice Missing Mixed Nonlinear Normal ParticleFilter Posterior RBPF Record Recursive Refused Runnalls
-SequentialLP Shaped Status Uniform UnscentedKalman Unsolved Window __version__ choose_memory compare ensemble_interval estimate
-forecast from_continuous learn resume score simulate stream
+BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Both Bound Box Cloud Comparison Constrained
+ConstrainedZonotopeFilter DataQualityWarning EllipsoidFilter Estimate Estimator ExtendedKalman FearnheadClifford GPB
+Gaussian Halfspaces HalfwidthError Hull IntervalFilter KalmanFilter KalmanSmoother Learned Linear LogTooBig Markov
+MemoryChoice Missing Mixed MixedFilter MixedWindow Nonlinear Normal ParticleFilter Posterior RBPF Record Recursive Refused
+Runnalls SequentialLP Shaped Status Uniform UnscentedKalman Unsolved Window ZonotopeFilter __version__ bound choose_memory compare
+ensemble_interval estimate forecast from_continuous learn resume score simulate stream
 """
 
 
@@ -27,7 +28,7 @@ def test_an_unknown_name_is_an_attribute_error():
 
 
 def test_importing_loads_no_optional_library():
-    heavy = ["scipy", "pandas", "polars", "pyarrow", "matplotlib", "narwhals", "typer", "highspy", "piqp"]
+    heavy = ["scipy", "pandas", "polars", "pyarrow", "matplotlib", "narwhals", "typer", "highspy", "piqp", "clarabel"]
     code = (
         f"import sys, halfwidth; halfwidth.Linear; halfwidth.estimate; print([m for m in {heavy} if m in sys.modules])"
     )

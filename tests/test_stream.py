@@ -238,7 +238,7 @@ def test_what_cannot_run_on_a_stream():
     with pytest.raises(hw.Refused, match="Uniform"):
         hw.stream(dataclasses.replace(walk(), w=hw.Uniform(1.0)), hw.KalmanFilter())
     with pytest.raises(hw.Refused, match="no default method"):
-        hw.stream(dataclasses.replace(walk(), w=hw.Uniform(1.0)))
+        hw.stream(dataclasses.replace(walk(), w=hw.Uniform.unknown()))
     with pytest.raises(hw.BadValue, match="`t`"):
         hw.stream(walk(), t=np.inf)
 

@@ -22,6 +22,7 @@ _HOME: dict[str, str] = {
     "Box": "spread",
     "Halfspaces": "spread",
     "Normal": "spread",
+    "Both": "spread",
     "Cloud": "spread",
     "Shaped": "spread",
     "Bernoulli": "loss",
@@ -39,10 +40,12 @@ _HOME: dict[str, str] = {
     "resume": "stream",
     "forecast": "forecast",
     "ensemble_interval": "methods.window",
-    "choose_memory": "methods.window",
-    "MemoryChoice": "methods.window",
     "compare": "methods.choose",
     "Comparison": "methods.choose",
+    "bound": "bound",
+    "Bound": "methods._functional",
+    "choose_memory": "methods.memory",
+    "MemoryChoice": "methods.memory",
     "learn": "learn",
     "Learned": "learn",
     "HalfwidthError": "errors",
@@ -62,6 +65,7 @@ _HOME: dict[str, str] = {
 __all__ = ["__version__", *sorted(_HOME)]
 
 if TYPE_CHECKING:
+    from halfwidth.bound import bound as bound
     from halfwidth.continuous import from_continuous as from_continuous
     from halfwidth.errors import BadLog as BadLog
     from halfwidth.errors import BadRecord as BadRecord
@@ -79,11 +83,13 @@ if TYPE_CHECKING:
     from halfwidth.learn import learn as learn
     from halfwidth.loss import Bernoulli as Bernoulli
     from halfwidth.loss import Markov as Markov
+    from halfwidth.methods._functional import Bound as Bound
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
     from halfwidth.methods.choose import Comparison as Comparison
     from halfwidth.methods.choose import compare as compare
     from halfwidth.methods.constrain import Constrained as Constrained
+    from halfwidth.methods.hull import Hull as Hull
     from halfwidth.methods.kalman import KalmanFilter as KalmanFilter
     from halfwidth.methods.kalman import KalmanSmoother as KalmanSmoother
     from halfwidth.methods.loss import BKF1 as BKF1
@@ -94,14 +100,20 @@ if TYPE_CHECKING:
     from halfwidth.methods.loss import FearnheadClifford as FearnheadClifford
     from halfwidth.methods.loss import Runnalls as Runnalls
     from halfwidth.methods.map import BatchLP as BatchLP
+    from halfwidth.methods.memory import MemoryChoice as MemoryChoice
+    from halfwidth.methods.memory import choose_memory as choose_memory
+    from halfwidth.methods.mixed import MixedFilter as MixedFilter
+    from halfwidth.methods.mixed_window import MixedWindow as MixedWindow
     from halfwidth.methods.nonlinear import ExtendedKalman as ExtendedKalman
     from halfwidth.methods.nonlinear import UnscentedKalman as UnscentedKalman
     from halfwidth.methods.particle import ParticleFilter as ParticleFilter
     from halfwidth.methods.posterior import Posterior as Posterior
     from halfwidth.methods.sequential import SequentialLP as SequentialLP
-    from halfwidth.methods.window import MemoryChoice as MemoryChoice
+    from halfwidth.methods.sets import ConstrainedZonotopeFilter as ConstrainedZonotopeFilter
+    from halfwidth.methods.sets import EllipsoidFilter as EllipsoidFilter
+    from halfwidth.methods.sets import IntervalFilter as IntervalFilter
+    from halfwidth.methods.sets import ZonotopeFilter as ZonotopeFilter
     from halfwidth.methods.window import Window as Window
-    from halfwidth.methods.window import choose_memory as choose_memory
     from halfwidth.methods.window import ensemble_interval as ensemble_interval
     from halfwidth.model import Linear as Linear
     from halfwidth.model import Nonlinear as Nonlinear
@@ -113,6 +125,7 @@ if TYPE_CHECKING:
     from halfwidth.result import Status as Status
     from halfwidth.score import score as score
     from halfwidth.simulate import simulate as simulate
+    from halfwidth.spread import Both as Both
     from halfwidth.spread import Box as Box
     from halfwidth.spread import Cloud as Cloud
     from halfwidth.spread import Halfspaces as Halfspaces
@@ -121,4 +134,4 @@ if TYPE_CHECKING:
     from halfwidth.stream import resume as resume
     from halfwidth.stream import stream as stream
 
-lazy(__name__, _HOME | {"vehicle": "vehicle"})
+lazy(__name__, _HOME | {"vehicle": "vehicle", "fusion": "fusion"})

@@ -16,10 +16,12 @@ from halfwidth.result import Estimate
 #: Methods tried in this order when none is given; the first that does not refuse the model runs.
 DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("KalmanSmoother", {}),
+    ("Hull", {}),
     ("UnscentedKalman", {"smooth": True}),
     ("GPB", {"depth": 5, "smooth": True}),
     ("Posterior", {}),
     ("BatchLP", {}),
+    ("MixedFilter", {}),
     ("ParticleFilter", {}),
 )
 

@@ -15,7 +15,7 @@ from halfwidth.methods.kalman import matrices
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate
-from halfwidth.spread import Box, Cloud, Normal, Spread
+from halfwidth.spread import Both, Box, Cloud, Normal, Spread
 
 
 def forecast(
@@ -103,6 +103,8 @@ def _tail(stack: Array, which: Any, s: slice) -> Array:
 def _part(spread: Spread | None, s: slice) -> Spread | None:
     if isinstance(spread, Normal):
         return Normal.of(spread.mean[s], spread.P[s])
+    if isinstance(spread, Both):
+        return Both(spread.mean[s], spread.P[s], spread.half[s])
     if isinstance(spread, Box):
         return Box(spread.lo[s], spread.hi[s], guaranteed=spread.guaranteed)
     if isinstance(spread, Cloud):

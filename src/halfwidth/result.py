@@ -40,7 +40,7 @@ class Estimate:
         Times of the record, s.
     x : (T, nx) array
         Point estimate of the state.
-    spread : Box, Normal, Shaped or Cloud, or None
+    spread : Box, Normal, Shaped, Both or Cloud, or None
         What is known beside the point.
     status : Status
     method : str

@@ -60,6 +60,28 @@ class Stream:
         """Time of the newest row, s."""
         return float(self._core.t)
 
+    def bound(self, c: ArrayLike, u: ArrayLike | None = None, dt: float | None = None) -> Any:
+        """Return the guaranteed `Bound` of c'x at the next row, before its outputs are seen.
+
+        Its `excess` says whether an output can be at all, and by how much it cannot.
+
+        Parameters
+        ----------
+        c : (nx,) array_like
+        u, dt
+            Inputs of the next row and the step to it, as in `push`.
+
+        Raises
+        ------
+        Refused
+            If the stream is not one of `Hull`.
+        Unsolved
+            If no trajectory fits the rows pushed so far.
+        """
+        if not hasattr(self._core, "bound"):
+            raise Refused(f"`{typed(self.method)}` guarantees nothing", hint="stream(model, Hull(memory=10))")
+        return self._core.bound(c, u, dt)
+
     def snapshot(self) -> bytes:
         """Return everything `resume` needs, as bytes.
 
@@ -116,13 +138,16 @@ def stream(model: Model, method: Any = None, *, t: float = 0.0) -> Stream:
 def _default(model: Model) -> Any:
     """Return the first recursive method that takes the model."""
     reasons = []
-    for name in ("KalmanFilter", "UnscentedKalman", "GPB"):
-        if name in methods.ESTIMATORS:
-            method = methods.load(name)()
-            reason = method.refuses(model)
-            if reason is None:
-                return method
-            reasons.append(reason)
+    defaults: tuple[tuple[str, dict[str, Any]], ...] = (
+        ("KalmanFilter", {}), ("Hull", {"memory": 10}), ("ZonotopeFilter", {}), ("UnscentedKalman", {}), ("GPB", {}),
+        ("MixedFilter", {}),
+    )  # fmt: skip
+    for name, settings in defaults:
+        method = methods.load(name)(**settings)
+        reason = method.refuses(model)
+        if reason is None:
+            return method
+        reasons.append(reason)
     message, hint = hinted(reasons[0])
     raise Refused(f"no default method runs on a stream of this model; {message}", hint=hint)
 
@@ -205,6 +230,9 @@ class _Stepped:
         self.state = self.method.step(model, self.state, row, inputs, self.t + step, step)
         self.t += step
         self.pushed += 1
+        answer = getattr(self.method, "answer", None)
+        if answer is not None:
+            return answer(model, self.state, self.t)  # type: ignore[no-any-return]
         x, P, loglik = self.method.belief(model, self.state)
         newest: Estimate = object.__new__(self.kind)
         verdict = getattr(self.method, "verdict", None)

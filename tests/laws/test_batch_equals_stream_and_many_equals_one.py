@@ -8,12 +8,16 @@ import halfwidth as hw
 
 
 def online(method):
-    """Whether a method has an online form; a smoother has one only with a lag, `Constrained` what it holds has."""
+    """Whether a method has an online form; a smoother has one only with a lag, a hull with a memory, `Constrained`
+    what it holds has.
+    """
     if isinstance(method, hw.Constrained):
         return online(method.method) and hasattr(method.method, "step")
     smooths = getattr(method, "smooth", False) or (
         type(method).__name__ == "KalmanSmoother" and not getattr(method, "lag", None)
     )
+    if type(method).__name__ == "Hull" and method.memory is None:
+        return False
     return not smooths and (hasattr(method, "stream") or hasattr(method, "step"))
 
 

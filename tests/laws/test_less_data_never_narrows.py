@@ -5,7 +5,7 @@ A belief cut at bounds is left out: the further outside its mean is, the less of
 
 import numpy as np
 import pytest
-from tests.cases import PAIRS, point_only, stochastic
+from tests.cases import PAIRS, point_only, stochastic, weighs
 
 import halfwidth as hw
 
@@ -14,10 +14,13 @@ SPREAD = [
     for m, c in PAIRS
     if isinstance(c.model, hw.Linear)
     and not stochastic(m)
+    and not weighs(m)
     and not point_only(m)
     and c.model.bounds is None
     and c.model.w.known
     and c.model.e.known
+    # the gain of these makes a set small, not its box: with fewer outputs another coordinate may gain
+    and type(m).__name__ not in ("ZonotopeFilter", "ConstrainedZonotopeFilter", "EllipsoidFilter")
 ]
 
 

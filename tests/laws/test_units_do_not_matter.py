@@ -70,7 +70,8 @@ def test_another_basis(method, case):
     one = hw.estimate(m, case.record, method)
     two = hw.estimate(turned, case.record, method)
     np.testing.assert_allclose(two.x @ inverse.T, one.x, rtol=1e-7, atol=1e-8)
-    np.testing.assert_allclose(two.loglik, one.loglik, rtol=1e-8)
+    if one.loglik is not None:
+        np.testing.assert_allclose(two.loglik, one.loglik, rtol=1e-8)
 
 
 def _symmetric(P):

@@ -61,7 +61,7 @@ def test_correlated_noise_with_unseen_partners_equals_rejection():
     np.testing.assert_array_equal(d.s, np.broadcast_to(np.r_[Q, R], d.s.shape))
 
 
-@pytest.mark.parametrize("prior", [None, [[-1.5, -1.0], [0.5, 0.7]]])
+@pytest.mark.parametrize("prior", [None, 0.6, [[-1.5, -1.0], [0.5, 0.7]]])
 @pytest.mark.parametrize("scale_every", [1, 10**9], ids=["scale moves", "plain"])
 def test_unknown_half_widths_equal_importance_sampling(prior, scale_every):
     """The scale move changes the speed, not the answer: its Jacobian is right."""
@@ -69,11 +69,11 @@ def test_unknown_half_widths_equal_importance_sampling(prior, scale_every):
     model = hw.Linear([[0.8]], None, [[1]], unknown, unknown, hw.Box(-1, 1))
     d = sample(
         model, record(SCALAR), draws=1500, thin=15, seed=3, scale_every=scale_every,
-        prior=None if prior is None else np.array(prior),
+        prior=np.array(prior) if isinstance(prior, list) else None, power=prior if isinstance(prior, float) else 1.0,
     )  # fmt: skip
     g, n = np.random.default_rng(0), 1_000_000
-    if prior is None:
-        q, r = g.uniform(0, 1, n), g.uniform(0, 1, n)
+    if not isinstance(prior, list):
+        q, r = g.uniform(0, 1, (2, n)) ** (1.0 / (prior or 1.0))
     else:
         q, r = np.exp(g.normal(prior[0][0], prior[1][0], n)), np.exp(g.normal(prior[0][1], prior[1][1], n))
     weight = ((q <= 1) & (r <= 1)).astype(float)

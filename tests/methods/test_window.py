@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import halfwidth as hw
-from halfwidth.methods.window import rows_since_fix, window_starts
+from halfwidth.methods._sliding import rows_since_fix, window_starts
 from halfwidth.reproduce import paper003
 
 UNKNOWN = hw.Uniform.unknown(at_most=10.0)
@@ -37,7 +37,7 @@ def test_the_general_way_and_the_fast_way_agree():
     method = hw.BatchLP(objective="paper", point="optimal")
     window = hw.Window(method, memory=8)
     fast = window.run(CART, record)
-    slow = window._any(CART, record, fast.info["start"], None)
+    slow = window._each(CART, record)
     np.testing.assert_allclose(
         fast.info["q"].sum(axis=1) + fast.info["r"].sum(axis=1), slow.s.sum(axis=1), rtol=1e-6, atol=1e-9
     )
@@ -48,50 +48,117 @@ def test_windows_stretch_until_every_output_has_fixes():
     seen[10:30, 0] = False
     seen[:, 1] = np.arange(40) % 7 == 0
     start = window_starts(seen, 5, fixes=3)
+    some = seen.any(axis=1)
     for t in range(40):
         held = seen[start[t] : t + 1].sum(axis=0)
         before = seen[: t + 1].sum(axis=0)
         assert np.all(held >= np.minimum(3, before))
+        assert some[start[t] : t + 1].sum() >= min(6, some[: t + 1].sum())
         assert start[t] <= max(0, t - 5)
     assert np.all(np.diff(start) >= 0)
-    np.testing.assert_array_equal(window_starts(seen, 5, fixes=0), np.maximum(0, np.arange(40) - 5))
+    full = np.ones((40, 2), bool)
+    for fixes in (0, 10):
+        np.testing.assert_array_equal(window_starts(full, 5, fixes=fixes), np.maximum(0, np.arange(40) - 5))
+    assert np.all(window_starts(~full, 5) == 0)
+    # Rows that nothing is seen in do not count, rows in which another output is lost do.
+    some = window_starts(seen[:, :1], 5, fixes=0)
+    np.testing.assert_array_equal(some[[29, 30, 34, 35]], [4, 5, 9, 30])
     assert np.all(np.arange(40) - window_starts(seen, 5, stretch=8) < 8)
     np.testing.assert_array_equal(rows_since_fix(np.array([[False], [True], [False], [False]])), [1, 0, 1, 2])
 
 
-def test_an_outage_longer_than_the_memory():
+@pytest.mark.parametrize("q", [(0.002, 0.005), (0.02, 0.05)])
+def test_an_outage_longer_than_the_memory(q):
     """60 s at 10 Hz with a memory of 25 rows: completes, says that it extrapolates, and takes up again."""
-    truth, record = cart(1000, seed=1)
-    lost = record.without(20.0, 80.0)
-    est = hw.estimate(CART, lost, hw.Window(hw.BatchLP(), memory=25)).check()
-    out = est.info["extrapolated"]
-    np.testing.assert_array_equal(out, ~lost.seen[:, 0])
-    assert "extrapolate" in est.message
-    error = np.abs(est.x - truth.x)[:, 0]
-    back = np.flatnonzero(out)[-1] + 1
-    assert error[back + 30 :].mean() < 0.1
-    # The jump on re-acquisition stays within what the half-widths seen before the outage allow to build up.
-    first = np.flatnonzero(out)[0]
-    q = est.info["q"][first - 25 : first].max(axis=0)
-    n = back - first + 1
-    state = np.abs(np.diff(est.info["smoothed"][first - 25 : first, 1])).max()
-    allowed = n * q[0] + 0.5 * H * n * n * q[1] + n * H * state + 2 * 0.3
-    assert abs(est.x[back, 0] - est.x[back - 1, 0]) <= allowed
+    for seed in range(6):
+        truth, record = cart(1000, seed=seed, q=q)
+        lost = record.without(20.0, 80.0)
+        est = hw.estimate(CART, lost, hw.Window(hw.BatchLP(), memory=25)).check()
+        out = est.info["extrapolated"]
+        np.testing.assert_array_equal(out, ~lost.seen[:, 0])
+        assert "extrapolate" in est.message
+        gap = np.flatnonzero(out)
+        back = gap[-1] + 1
+        error = np.abs(est.x - truth.x)
+        assert error[back : back + 5, 0].mean() < 0.25
+        assert error[back + 30 :, 0].mean() < 0.1
+        # Without a fix nothing is learned: the estimate moves on along the model.
+        A, B = np.array([[1, H], [0, 1]]), np.array([H * H / 2, H])
+        np.testing.assert_allclose(est.x[gap], est.x[gap - 1] @ A.T + lost.u[gap] * B, atol=1e-12)
+        assert np.all(est.info["iterations"][gap] == 0)
+        # The jump on re-acquisition is within the interval that the last row without a fix states, on line ...
+        jump = np.abs(est.x[back] - est.x[back - 1])
+        lo, hi = hw.ensemble_interval(est, newest=True)
+        assert np.all(jump <= (hi - lo)[back - 1])
+        assert np.all((est.x[back] >= lo[back - 1] - 1) & (est.x[back] <= hi[back - 1] + 1))
+        # ... and within the one that the windows on its far side leave of it.
+        lo, hi = hw.ensemble_interval(est)
+        step = np.abs(est.info["smoothed"][back] - est.info["smoothed"][back - 1])
+        assert np.all(jump <= (hi - lo)[back - 1] + step + 0.5)
+        assert np.all(est.info["windows"][gap] > back - gap)
 
 
-def test_stream_follows_the_batch_and_resumes():
-    _, record = cart(80)
-    lost = record.without(3.0, 5.0)
-    window = hw.Window(hw.BatchLP(objective="paper", point="optimal"), memory=10)
+def test_an_interval_in_an_outage_grows_and_mostly_holds():
+    held = []
+    for seed in range(8):
+        truth, record = cart(600, seed=seed)
+        lost = record.without(20.0, 50.0)
+        est = hw.estimate(CART, lost, hw.Window(hw.BatchLP(), memory=25))
+        lo, hi = hw.ensemble_interval(est, newest=True)
+        gap = np.flatnonzero(est.info["extrapolated"])
+        assert np.all(np.diff((hi - lo)[gap], axis=0) > 0)
+        held.append(((truth.x >= lo) & (truth.x <= hi))[gap].mean())
+    assert np.mean(held) > 0.9
+
+
+@pytest.mark.parametrize("carry", [None, 2.0])
+@pytest.mark.parametrize(
+    "method",
+    [
+        hw.BatchLP(), hw.BatchLP(point="optimal"), hw.BatchLP(objective="paper", point="optimal"),
+        hw.SequentialLP(rounds=1), hw.SequentialLP(rounds=2, point="optimal"),
+    ],
+)  # fmt: skip
+def test_stream_follows_the_batch_and_resumes(method, carry):
+    _, record = cart(70)
+    lost = record.without(3.0, 4.5)
+    window = hw.Window(method, memory=10, carry=carry)
     est = hw.estimate(CART, lost, window)
     live = hw.stream(CART, window)
-    for t in range(50):
+    lo, hi = hw.ensemble_interval(est, newest=True)
+    flat = isinstance(method, hw.BatchLP) and method.point == "optimal"  # optimal points are no single point
+    for t in range(70):
         newest = live.push(lost.y[t], lost.u[t])
         assert newest.info["extrapolated"] == est.info["extrapolated"][t]
-        assert newest.q.sum() + newest.r.sum() == pytest.approx(
-            est.info["q"][t].sum() + est.info["r"][t].sum(), rel=1e-6, abs=1e-9
-        )
+        total = est.info["q"][t].sum() + est.info["r"][t].sum()
+        assert newest.q.sum() + newest.r.sum() == pytest.approx(total, rel=1e-3 if carry and flat else 1e-6, abs=1e-7)
+        if not flat:
+            np.testing.assert_allclose(newest.x[0], est.x[t], rtol=1e-6, atol=1e-8)
+            ends = hw.ensemble_interval(newest, newest=True)
+            np.testing.assert_allclose(ends, (lo[t : t + 1], hi[t : t + 1]), rtol=1e-5, atol=1e-7)
+        if t in (5, 35, 50):
+            live = hw.resume(live.snapshot(), CART)
+            again = hw.resume(live.snapshot(), CART)
+            for k in range(t + 1, t + 4):
+                np.testing.assert_array_equal(again.push(lost.y[k], lost.u[k]).x, live.push(lost.y[k], lost.u[k]).x)
+            live = hw.resume(hw.stream(CART, window).snapshot(), CART)
+            for k in range(t + 1):
+                live.push(lost.y[k], lost.u[k])
     assert newest.x.shape == (1, 2)
+
+
+def test_what_a_window_forgets_it_forgets():
+    """An optimum must not depend on the windows before, beyond its tolerance."""
+    drawn = paper003.draw(4, correlated=False, rows=400)
+    model = paper003.system(unknown=False, correlated=False)
+    window = hw.Window(hw.BatchLP(objective="paper", point="optimal"), memory=25, fixes=0)
+    whole = window.run(model, drawn.record)
+    for a in (100, 173):
+        late = hw.Record(drawn.record.t[a:], drawn.record.y[a:], drawn.record.u[a:])
+        free = dataclasses.replace(model, x0=paper003.BOX)
+        part = window.run(free, late)
+        total = [np.hstack([e.info["q"], e.info["r"]]).sum(axis=1) for e in (whole, part)]
+        np.testing.assert_allclose(total[1][25:], total[0][a + 25 :], rtol=1e-7, atol=1e-9)
 
 
 def test_unknown_entries_on_line():
@@ -113,7 +180,7 @@ def test_ensemble_interval():
     narrow = hw.ensemble_interval(est, kappa=1.0)
     done = slice(0, 300 - 25)
     assert np.all(hi[done] >= lo[done])
-    np.testing.assert_allclose((hi - lo)[done], 2 * (narrow[1] - narrow[0])[done])
+    np.testing.assert_allclose((hi - lo)[done], 2 * (narrow[1] - narrow[0])[done], atol=1e-12)
     inside = (drawn.x[done] >= lo[done]) & (drawn.x[done] <= hi[done])
     assert inside.mean() > 0.8
     assert np.isnan(lo[-1]).all()

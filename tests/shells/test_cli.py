@@ -56,7 +56,7 @@ def test_help_names_every_command_and_the_exit_codes(capsys):
         ("fill", "--output -o --report --method --level --clock-offset --json --dry-run --force --quiet --verbose "
                  "-v --no-progress --columns --format"),
         ("check", "--json --columns"),
-        ("outages", "--lengths --starts --seed --methods --clock-offset --json --columns"),
+        ("outages", "--lengths --starts --seed --methods --clock-offset --plot --json --columns"),
         ("demo", "--output --seed --json --force"),
         ("estimate", "--output --method --level --seed --json --force"),
         ("doctor", "--json"),
@@ -380,6 +380,17 @@ def test_outages(log, capsys):
     data = json.loads(capsys.readouterr().out)
     assert data["schema_version"] == 1
     assert {cell["method"] for cell in data["cells"]} == {"linear", "em"}
+    assert data["longest_within_s"].keys() == {"linear", "em"}
+
+
+def test_outages_plotted(log, tmp_path, capsys):
+    pytest.importorskip("matplotlib").use("Agg")
+    args = ["outages", log, "--lengths", "1", "--starts", "2", "--methods", "linear", "--plot", str(tmp_path / "o.svg")]
+    assert cli.run(args) == GOOD
+    assert "<svg" in (tmp_path / "o.svg").read_text()
+    assert cli.run(args) != GOOD  # it is there already
+    assert "--force" in capsys.readouterr().err
+    assert cli.run([*args, "--force"]) == GOOD
 
 
 def test_demo(tmp_path, capsys):

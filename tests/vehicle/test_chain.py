@@ -8,6 +8,10 @@ from tests.vehicle.known import known
 from halfwidth.result import Status
 from halfwidth.vehicle import chain
 from halfwidth.vehicle.grid import sampled
+from halfwidth.vehicle.pointing import azimuth_of
+
+GAUSSIAN = {"tail": np.inf}
+SIGMA = np.array([0.1, 0.05, 0.1, 0.01, 0.3, 0.1, 0.3])
 
 
 def noisy(**change):
@@ -16,32 +20,31 @@ def noisy(**change):
 
 def test_one_round_is_dense_least_squares_over_the_rows_of_the_table():
     drive = sampled(noisy(duration=5.0, scale=1.02, bias=0.01).log).without(2.0, 3.0)
-    psi = chain.azimuth_of(drive)
-    for sigma in (np.array([0.1, 0.05, 0.01, 0.3, 0.3]), np.array([0.02, 0.2, 0.05, 0.1, 1.0])):
+    psi = azimuth_of(drive)
+    for sigma in (SIGMA, np.array([0.02, 0.2, 0.3, 0.05, 0.1, 0.3, 1.0])):
         z, P, _ = chain_round(
             drive.t, drive.east, drive.north, drive.seen, drive.speed, drive.yaw_rate, psi, sigma, far=100.0
         )
-        fit = chain.solve([drive], chain.Chain(rounds=1), sigma=sigma)[0]
+        fit = chain.solve([drive], chain.Chain(rounds=1, **GAUSSIAN), sigma=sigma)[0]
         np.testing.assert_allclose(fit.z, z, atol=2e-6)
         T = len(drive)
-        blocks = P.reshape(T, 7, T, 7)[range(T), :, range(T)]
+        blocks = P.reshape(T, 9, T, 9)[range(T), :, range(T)]
         np.testing.assert_allclose(fit.P, blocks, atol=1e-6 * np.abs(blocks).max(axis=0).max(), rtol=1e-4)
 
 
 def test_scales_are_means_of_posterior_squares():
     drive = sampled(noisy(duration=5.0).log).without(2.0, 3.0)
-    sigma = np.array([0.1, 0.05, 0.01, 0.3, 0.3])
     *_, new = chain_round(
-        drive.t, drive.east, drive.north, drive.seen, drive.speed, drive.yaw_rate, chain.azimuth_of(drive), sigma
+        drive.t, drive.east, drive.north, drive.seen, drive.speed, drive.yaw_rate, azimuth_of(drive), SIGMA
     )
-    fit = chain.solve([drive], chain.Chain(rounds=2), sigma=sigma)[0]
+    fit = chain.solve([drive], chain.Chain(rounds=2, **GAUSSIAN), sigma=SIGMA)[0]
     # groups of both axes count one pseudo-row for two residuals
     np.testing.assert_allclose(fit.sigma, new, rtol=2e-3)
 
 
 def test_learning_raises_the_likelihood():
     drive = sampled(noisy(duration=100.0).log).without(40.0, 60.0)
-    loglik = [chain.solve([drive], chain.Chain(rounds=n))[0].loglik for n in (1, 3, 8, 24)]
+    loglik = [chain.solve([drive], chain.Chain(rounds=n, **GAUSSIAN))[0].loglik for n in (1, 3, 8, 24)]
     assert np.all(np.diff(loglik) > 0)
 
 
@@ -128,10 +131,44 @@ def test_standing_still_all_the_time():
     assert t.size == 300
 
 
+def test_a_jump_of_the_receiver_far_from_a_gap_does_not_bend_it():
+    made = known(160.0, rate=5.0, noise=0.02, speed_noise=0.02, yaw_noise=0.002, seed=4)
+    drive = sampled(made.log)
+    hidden = (drive.t >= 60) & (drive.t <= 90)
+    jumped = dataclasses.replace(drive, east=drive.east + 2.0 * (drive.t > 110))
+    fit = chain.solve([jumped.without(60, 90)])[0]
+    assert int(np.argmin(fit.weight)) == int(np.searchsorted(drive.t, 110, side="right"))
+    assert fit.weight.min() < 0.1
+    assert np.hypot(fit.path.east - drive.east, fit.path.north - drive.north)[hidden].mean() < 0.4
+
+
+def test_a_fix_error_that_drifts_is_carried_into_the_gap():
+    made = known(160.0, rate=5.0, noise=0.02, speed_noise=0.02, yaw_noise=0.002, seed=5)
+    drive = sampled(made.log)
+    # the receiver drifts off by up to 3 m and back, smoothly, again and again
+    drive = dataclasses.replace(drive, north=drive.north + 3.0 * np.sin(2 * np.pi * drive.t / 25.0))
+    off = {}
+    for drifting in (True, False):
+        errors = []
+        for t0 in (40.0, 60.0, 85.0, 110.0):
+            hidden = (drive.t >= t0) & (drive.t <= t0 + 4)
+            path = chain.solve([drive.without(t0, t0 + 4)], chain.Chain(drifting=drifting))[0].path
+            errors.append(np.hypot(path.east - drive.east, path.north - drive.north)[hidden].mean())
+        off[drifting] = np.mean(errors)
+    assert off[True] < 0.7 * off[False]
+
+
+def test_fixes_wrong_by_white_noise_only_have_no_offset():
+    drive = sampled(noisy(duration=60.0, offset=0.0).log).without(20, 30)
+    fit = chain.solve([drive], chain.Chain(slow=False))[0]
+    assert np.abs(fit.z[:, [chain.OFFSET_E, chain.OFFSET_N]]).max() < 1e-2
+    assert fit.path.info["slow_sd"] == 0.0
+
+
 def test_a_first_azimuth_points_along_the_way():
     made = noisy(duration=100.0, bias=0.01)
     drive = sampled(made.log).without(40, 70)
     true = made.azimuth[np.searchsorted(made.t, drive.t)]
-    off = np.angle(np.exp(1j * (chain.azimuth_of(drive) - true)))
+    off = np.angle(np.exp(1j * (azimuth_of(drive) - true)))
     assert np.abs(off).max() < 0.6
     assert np.abs(off[drive.seen]).mean() < 0.1

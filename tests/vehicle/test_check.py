@@ -7,7 +7,7 @@ import pytest
 from tests.vehicle.drives import drive, save
 
 import halfwidth as hw
-from halfwidth.vehicle.check import quantisation
+from halfwidth.vehicle.align import quantisation
 
 
 def checked(tmp_path, **changes):
@@ -117,7 +117,7 @@ def test_continuous_values_have_no_step():
 def test_what_a_log_cannot_tell_is_not_checked(tmp_path):
     still = {"t_s": np.arange(300.0), "lat_deg": np.full(300, 50.0), "lon_deg": np.full(300, 14.0)}
     found = hw.vehicle.check(save(tmp_path / "log.csv", still))
-    for name in ("speed", "azimuth", "yaw rate", "speed scale", "yaw bias", "clock offset", "standstill"):
+    for name in ("speed", "azimuth", "yaw rate", "speed scale", "yaw bias", "clock of speed", "standstill"):
         assert found[name].verdict == "not checked"
 
 

@@ -137,9 +137,66 @@ def test_other_rates(rate):
     assert log.rates()["speed_mps"] == pytest.approx(rate)
 
 
+CLEAN = {"fix_noise": 0.0, "fix_offset": 0.0, "tunnels": [], "duration": 100, "yaw_noise": 0.0, "yaw_bias": 0.0,
+         "yaw_drift": 0.0, "speed_step": 0.0}  # fmt: skip
+
+
+def test_each_stream_has_its_own_delay():
+    truth, log = simulate_drive(clock_offset=0.1, speed_delay=0.3, yaw_delay=-0.2, **CLEAN)
+    inside = (log.t > 1) & (log.t < 99)
+    at = log.t[inside]
+    assert np.abs(log.speed_mps[inside] - np.interp(at - 0.3, truth.t, truth.speed_mps)).max() < 0.02
+    assert np.abs(log.yaw_rate_radps[inside] - np.interp(at + 0.2, truth.t, truth.yaw_rate_radps)).max() < 0.01
+    assert (truth.clock_offset, truth.speed_delay, truth.yaw_delay) == (0.1, 0.3, -0.2)
+
+
+def test_the_gyro_may_be_quantised():
+    log = simulate_drive(duration=60, tunnels=[], yaw_step=0.002)[1]
+    assert np.abs(log.yaw_rate_radps / 0.002 - np.round(log.yaw_rate_radps / 0.002)).max() < 1e-9
+
+
+def test_an_antenna_swings_about_the_axle():
+    axle = simulate_drive(**CLEAN)[0]
+    truth, log = simulate_drive(antenna=(1.5, 0.4), **CLEAN)
+    assert np.array_equal(truth.speed_mps, axle.speed_mps)
+    east, north = axle.error_m(truth.t, truth.lat_deg, truth.lon_deg)
+    azimuth = truth.azimuth_rad
+    assert np.allclose(east * np.sin(azimuth) + north * np.cos(azimuth), 1.5, atol=1e-3)
+    assert np.allclose(north * np.sin(azimuth) - east * np.cos(azimuth), 0.4, atol=1e-3)
+    assert np.abs(truth.error_m(log.t, log.lat_deg, log.lon_deg)).max() < 1e-6  # the fixes are the antenna's
+
+
+def test_two_antennas_know_the_azimuth_without_moving():
+    given = CLEAN | {"fix_noise": 0.01, "fix_offset": 1.0}
+    truth, log = simulate_drive(antenna=(0.2, 0.0), second=(1.2, 0.5), **given)
+    other = truth.second
+    assert np.array_equal(other.fixed, log.fixed)
+    wrong = np.angle(np.exp(1j * (log.azimuth_rad - truth.azimuth_rad)))
+    assert np.isfinite(wrong).all()
+    assert (truth.speed_mps == 0).any()
+    assert abs(wrong.mean()) < 1e-3
+    assert wrong.std() == pytest.approx(0.01 * np.sqrt(2) / np.hypot(1.0, 0.5), rel=0.1)
+    between = steps_m(np.ravel([log.lat_deg, other.lat_deg], "F"), np.ravel([log.lon_deg, other.lon_deg], "F"))[::2]
+    assert between.mean() == pytest.approx(np.hypot(1.0, 0.5), abs=0.01)  # they share the slow error
+
+
+def test_multipath_fades_after_a_tunnel():
+    given = CLEAN | {"outages": [(40.0, 50.0)]}
+    truth, log = simulate_drive(multipath=8.0, multipath_time=2.0, **given)
+    seen = log.fixed
+    off = np.hypot(*truth.error_m(log.t[seen], log.lat_deg[seen], log.lon_deg[seen]))
+    since = log.t[seen] - 50.0
+    assert np.allclose(off, np.where(since > 0, 8 * np.exp(-since / 2), 0), atol=1e-2)
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
+        ({"speed_delay": 1e3}, "`speed_delay` is 1000"),
+        ({"clock_offset": np.nan}, "`clock_offset` is nan"),
+        ({"multipath": -1}, "`multipath` is -1"),
+        ({"multipath_time": 0}, "`multipath_time` is 0"),
+        ({"second": (0.0, 0.0)}, "at least 0.1 m"),
         ({"duration": 1}, "`duration` is 1 s"),
         ({"rate": 0}, "`rate` is 0 Hz"),
         ({"fix_rate": 20}, "`fix_rate` is 20 Hz"),

@@ -9,7 +9,7 @@ import halfwidth as hw
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle.estimators import METHODS
 from halfwidth.vehicle.log import Log
-from halfwidth.vehicle.outage import Outages, outages
+from halfwidth.vehicle.outage import Cell, Outages, outages
 
 FAST = ("linear", "cv", "em")
 
@@ -88,9 +88,57 @@ def test_an_outage_that_has_no_place_is_an_error_that_says_what_has(log):
         outages(standing, (5,), 3, 1, ("em",))
 
 
-def test_the_table_says_that_its_intervals_are_not_widened(table):
-    assert "own 90 % interval, before widening" in str(table)
-    assert "before widening" in table.to_dict()["interval"]
+def test_the_table_says_which_intervals_are_sized(table):
+    assert "own 90 % interval, before it is sized" in str(table)
+    assert "sized by the other outages" in str(table)
+    assert "held" in table.to_dict()["interval"]
+    cell = table.cell("cv", 5)
+    assert cell.coverage is not None
+    assert 0.5 < cell.held <= 1.0
+    assert cell.half_width > 0
+    assert outages_of_two(table).held is None
+
+
+def outages_of_two(table):
+    cell = table.cell("cv", 5)
+    return dataclasses.replace(cell, start=cell.start[:2], needed=cell.needed[:2], half=cell.half[:2])
+
+
+def test_an_interval_is_sized_by_outages_that_do_not_overlap_with_its_own():
+    start = np.array([0.0, 2.0, 20.0, 40.0, 60.0])
+    needed = tuple(np.full(4, v) for v in (9.0, 8.0, 1.0, 2.0, 3.0))
+    zeros = np.zeros(5)
+    cell = Cell("x", 5.0, start, zeros, zeros, np.full(5, 2), needed, True, 0.9, zeros + 1.0, 0, 0.0)
+    np.testing.assert_array_equal(cell.factors, [3.0, 3.0, 9.0, 9.0, 9.0])
+    assert cell.held == pytest.approx(12 / 20)
+    assert cell.half_width == pytest.approx(33 / 5)
+
+
+def test_how_long_an_outage_may_last():
+    def cell(length, worst):
+        one = np.array([worst])
+        return Cell("x", length, one, one, one, np.array([1]), (one,), False, 0.9, one, 0, 0.0)
+
+    table = Outages("", (cell(1.0, 0.1), cell(10.0, 1.0)), 0.9, 1, 0.0)
+    assert table.within(0.1**0.5)["x"] == pytest.approx(10**0.5)
+    assert table.within(0.05)["x"] == 0.0
+    assert table.within(2.0)["x"] == 10.0
+
+
+def test_the_plot_has_a_line_for_each_method_and_one_for_the_tolerance(table):
+    pytest.importorskip("matplotlib").use("Agg")
+    ax = table.plot(tolerance=0.5)
+    assert len(ax.lines) == 2 * len(table.methods) + 1
+    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert labels == [*table.methods, "tolerance 0.5 m"]
+
+
+def test_clocks_are_found_if_none_is_given():
+    log = known(200.0, rate=10.0, noise=0.02, late=0.3).log
+    found = outages(log, (10,), 4, 1, ("em",))
+    assert np.isnan(found.clock_offset)
+    assert found.sensors
+    assert found.cell("em", 10).mean < outages(log, (10,), 4, 1, ("em",), clock_offset=0.0).cell("em", 10).mean
 
 
 def test_progress_and_settings(log):
@@ -107,7 +155,7 @@ def test_progress_and_settings(log):
 def test_a_right_clock_offset_helps():
     log = known(200.0, rate=10.0, noise=0.02, late=0.3).log
     table = [outages(log, (10,), 6, 1, ("em",), clock_offset=offset).cell("em", 10).mean for offset in (0.0, 0.3, -0.3)]
-    assert table[1] < 0.5 * table[0] < table[2]
+    assert table[1] < 0.7 * table[0] < table[2]
 
 
 @pytest.mark.parametrize(
@@ -151,7 +199,7 @@ def test_the_chain_is_never_worse_than_a_straight_line(data, name):
         assert chain.failed == 0
 
 
-@pytest.mark.parametrize(("name", "length", "row"), [("smartloc", 30, 0.42), ("balzer", 30, 4.05)])
+@pytest.mark.parametrize(("name", "length", "row"), [("smartloc", 30, 0.38), ("balzer", 30, 4.0)])
 def test_the_chain_is_near_what_is_known_of_it(data, name, length, row):
     """Means of other random starts, so within their standard errors of 15 to 25 %, both times."""
     cell = outages(real_log(data, name), (length,), 12, 1, ("em",)).cell("em", float(length))

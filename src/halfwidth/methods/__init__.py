@@ -21,7 +21,14 @@ ESTIMATORS: dict[str, str] = {
     "SequentialLP": "sequential",
     "Window": "window",
     "Posterior": "posterior",
+    "Hull": "hull",
     "Constrained": "constrain",
+    "MixedFilter": "mixed",
+    "MixedWindow": "mixed_window",
+    "IntervalFilter": "sets",
+    "ZonotopeFilter": "sets",
+    "ConstrainedZonotopeFilter": "sets",
+    "EllipsoidFilter": "sets",
 }
 
 

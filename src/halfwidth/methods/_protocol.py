@@ -39,6 +39,9 @@ class Recursive(Protocol[State]):
 
     One that has more to say of a row also gives ``verdict(model, state)``: the code of `Newest.status`, a message or
     None, and the (lo, hi) that intervals end at, or None.
+
+    One whose answer is not Gaussian gives ``answer(model, state, t) -> Estimate`` of the newest row instead of
+    `belief`, and its own `run`.
     """
 
     def init(self, model: Model) -> State:

@@ -25,7 +25,7 @@ from halfwidth.array import Array, generator
 from halfwidth.methods._residuals import Residuals, reference, residuals
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.sequential import SequentialLP, filled
-from halfwidth.model import Linear, Model
+from halfwidth.model import Linear, Model, needs_a_box
 from halfwidth.noise import Gaussian, Noise, Uniform
 from halfwidth.record import Record
 from halfwidth.spread import Box, Normal
@@ -63,6 +63,8 @@ def refuses(model: Model) -> str | None:
     """Return why a model cannot be sampled, or None."""
     if not isinstance(model, Linear):
         return "the sampler needs a linear model but the model is nonlinear\nhint: the posterior by linearisation"
+    if (reason := needs_a_box(model, "the sampler")) is not None:
+        return reason
     for name, noise in (("w", model.w), ("e", model.e)):
         if not isinstance(noise, Uniform | Gaussian):
             return (
@@ -77,11 +79,11 @@ def refuses(model: Model) -> str | None:
     return None
 
 
-def improper(model: Linear, record: Record, prior: Array | None) -> str | None:
+def improper(model: Linear, record: Record, prior: Array | None, power: float = 1.0) -> str | None:
     """Return which half-width neither the record nor its prior bounds from above, or None."""
     count = np.r_[np.full(model.nx, len(record)), record.seen.sum(axis=0)]
     floor, cap, kind = _ends(model)
-    for j in np.flatnonzero((kind > 0) & (floor < cap) & np.isinf(cap) & (count < 2)):
+    for j in np.flatnonzero((kind > 0) & (floor < cap) & np.isinf(cap) & (count <= power)):
         if prior is None or not np.isfinite(prior[1, j]):
             name = model.names.x[j] if j < model.nx else model.names.y[j - model.nx]
             return (
@@ -102,6 +104,7 @@ def sample(
     whitened: int = 4,
     scale_every: int = 4,
     prior: Array | None = None,
+    power: float = 1.0,
     seed: int | None = None,
 ) -> Draws | None:
     """Draw trajectories, half-widths and unknown entries from their posterior.
@@ -121,7 +124,9 @@ def sample(
         Whitened moves every fourth sweep, and sweeps from one scale move of a state to the next.
     prior : (2, nx + ny) array, optional
         Mean and standard deviation of a normal prior of the log half-widths; an infinite deviation, as their absence,
-        means a prior flat in the half-width.
+        means a prior s^(power - 1).
+    power : float
+        Above 0; 1 is a prior flat in the half-width, small ones are nearly flat in its logarithm.
     seed : int, optional
 
     Returns
@@ -158,7 +163,7 @@ def sample(
     for child in rng.integers(0, 2**63, size=chains):
         X, s, th, code = _core.sampler_run(
             rows.M.indptr.astype(np.int64), rows.M.indices.astype(np.int64), rows.M.data, rows.b,
-            place, first, rows.state, weight, count.astype(np.int64), np.array([floor, cap, tiny]), normal,
+            place, first, rows.state, weight, count.astype(np.int64), np.array([floor, cap, tiny]), normal, power,
             np.array([rows.lo, rows.hi]),
             at.indptr.astype(np.int64), at.data.astype(np.int64), place[at.indices], x0, s0,
             rows.theta_start, rows.theta_row, rows.theta_at, rows.theta_slope,
@@ -167,7 +172,7 @@ def sample(
         )  # fmt: skip
         if code:
             return None
-        s[:, (count == 0) & (kind > 0)] = _from_prior(rng, draws, floor, cap, normal, (count == 0) & (kind > 0))
+        s[:, (count == 0) & (kind > 0)] = _from_prior(rng, draws, floor, cap, normal, power, (count == 0) & (kind > 0))
         s[:, kind == 0] = np.nan
         xs.append(X[:, rows.states].reshape(draws, -1, nx))
         ss.append(s)
@@ -313,7 +318,8 @@ def _rows(model: Linear, record: Record) -> _Rows:
     back = np.argsort(order)
     M = sp.csr_array(M[:, order])
     M.sort_indices()
-    box = model.bounds or Box(np.full(nx, -np.inf), np.full(nx, np.inf))
+    free = Box(np.full(nx, -np.inf), np.full(nx, np.inf))
+    box = model.bounds if isinstance(model.bounds, Box) else free
     prior = model.x0 if isinstance(model.x0, Box) else Box(np.full(nx, -np.inf), np.full(nx, np.inf))
     lo = np.r_[prior.lo, np.tile(box.lo, T), np.full(tl.size, -np.inf)][order]
     hi = np.r_[prior.hi, np.tile(box.hi, T), np.full(tl.size, np.inf)][order]
@@ -479,7 +485,7 @@ def _places(group: NDArray[np.int64], p: int, sd: Array) -> tuple[NDArray[np.int
 
 
 def _from_prior(
-    rng: np.random.Generator, draws: int, floor: Array, cap: Array, normal: Array, mine: NDArray[np.bool_]
+    rng: np.random.Generator, draws: int, floor: Array, cap: Array, normal: Array, power: float, mine: NDArray[np.bool_]
 ) -> Array:
     """Draw the half-widths that no row speaks of, (draws, k): their prior is their posterior."""
     out = np.zeros((draws, int(mine.sum())))
@@ -487,5 +493,6 @@ def _from_prior(
         if normal[1, j] > 0:
             out[:, k] = np.clip(np.exp(rng.normal(normal[0, j], normal[1, j], draws)), floor[j], cap[j])
         else:
-            out[:, k] = rng.uniform(floor[j], cap[j], draws)
+            lo, hi = floor[j] ** power, cap[j] ** power
+            out[:, k] = (lo + (hi - lo) * rng.uniform(size=draws)) ** (1.0 / power)
     return out

@@ -21,7 +21,7 @@ is corrected (the coefficient of ``F[k, j]`` in row k is ``-y[j]``).
 
 import dataclasses
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -126,6 +126,11 @@ class SequentialLP:
         theta = start_theta(rows, self.theta)
         x = rows.start(theta)
         c = np.ones(rows.groups) if self.objective == "paper" else rows.weights(x, theta)
+        found = self.descend(rows, x, theta, c)
+        return finished(self, model, record, rows, c, found)
+
+    def descend(self, rows: "Rows", x: Array, theta: Array, c: Array) -> "Descent":
+        """Follow linearisations from (x, theta) as long as they lower the true objective."""
         best = rows.worth(x, theta, c)
         status, answer = Status.STALLED, None
         history = [best]
@@ -146,7 +151,17 @@ class SequentialLP:
             history.append(value)
             if abs(gain) <= self.tol * max(abs(value), 1e-300) and len(history) > 2:
                 break
-        return finished(self, model, record, rows, x, theta, c, status, answer, history)
+        return Descent(x, theta, status, answer, history)
+
+
+class Descent(NamedTuple):
+    """Where linearisations led: states, theta, how the last program went, and the objective after each."""
+
+    x: Array
+    theta: Array
+    status: Status
+    answer: Answer | None
+    history: list[float]
 
 
 class LinearRows:
@@ -392,6 +407,33 @@ def rows_of(model: Model, record: Record, drift: float | None = None) -> Rows:
     return LinearRows(model, record, drift) if isinstance(model, Linear) else NonlinearRows(model, record)
 
 
+def expected(model: Model, record: Record, k: int, x: Array) -> Array:
+    """Return the states of row k, (n, nx), that a model without unknown entries expects after x, (n, nx)."""
+    u = None if record.u is None else record.u[k]
+    dt = float(record.t[k] - record.t[k - 1]) if k else model.dt
+    if not isinstance(model, Linear):
+        return np.array([model.move(one, u, dt) for one in x], dtype=np.float64).reshape(x.shape)
+    t = float(record.t[k])
+    moved = x @ model.A.at(t, dt, k).T
+    if model.B is not None and u is not None:
+        moved = moved + model.B.at(t, dt, k) @ u
+    return np.asarray(moved if model.E is None else np.linalg.solve(model.E.at(t, dt, k), moved.T).T, dtype=np.float64)
+
+
+def growth(model: Model, record: Record, k: int, x: Array, half: Array, q: Array) -> Array:
+    """Return how far a state within `half` of x may be from what is expected at row k, if its noise keeps within q."""
+    dt = float(record.t[k] - record.t[k - 1]) if k else model.dt
+    if not isinstance(model, Linear):
+        u = None if record.u is None else record.u[k]
+        return np.asarray(np.abs(model.linearise(x, u, dt).g_x) @ half + q)
+    t = float(record.t[k])
+    A = model.A.at(t, dt, k)
+    if model.E is None:
+        return np.asarray(np.abs(A) @ half + q)
+    left = np.linalg.inv(model.E.at(t, dt, k))
+    return np.asarray(np.abs(left @ A) @ half + np.abs(left) @ q)
+
+
 def filled(model: Linear, theta: Array) -> Linear:
     """Return the model with its unknown entries set to theta."""
     entries = model.theta_entries
@@ -449,14 +491,11 @@ def finished(
     model: Model,
     record: Record,
     rows: Rows,
-    x: Array,
-    theta: Array,
     c: Array,
-    status: Status,
-    answer: Answer | None,
-    history: list[float],
+    found: Descent,
 ) -> Estimate:
-    """Return the estimate at (x, theta)."""
+    """Return the estimate of a descent."""
+    x, theta, status, answer, history = found
     rho = rows.residuals(x, theta)
     s = largest(rho, rows.floor)
     over = s > rows.cap * (1.0 + 1e-6)

@@ -11,7 +11,7 @@ from typing import Any
 from halfwidth.errors import BadValue
 
 #: Papers that are reproduced here, by number.
-PAPERS: dict[str, str] = {"000": "paper000", "001": "paper001", "003": "paper003"}
+PAPERS: dict[str, str] = {"000": "paper000", "001": "paper001", "003": "paper003", "004": "paper004"}
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,9 @@ import numpy as np
 from halfwidth.array import Array
 from halfwidth.methods.constrain import Constrained
 from halfwidth.methods.map import BatchLP
+from halfwidth.methods.memory import prediction_errors
 from halfwidth.methods.sequential import SequentialLP
-from halfwidth.methods.window import Window, ensemble_interval, prediction_errors
+from halfwidth.methods.window import Window, ensemble_interval
 from halfwidth.model import Linear
 from halfwidth.noise import Gaussian, Uniform
 from halfwidth.record import Record
@@ -293,7 +294,8 @@ def table_three(*, quick: bool = False) -> Table:
 
 def central_gain(*, quick: bool = False) -> Table:
     """Filter error of the central point beside the optimal point and a simplex vertex."""
-    from halfwidth.methods.window import window_chain, window_starts
+    from halfwidth.methods._sliding import window_starts
+    from halfwidth.methods.window import window_chain
     from halfwidth.solvers.lp import HIGHS, solve
 
     every, seeds = (40, range(1)) if quick else (40, range(3))

@@ -241,8 +241,12 @@ def outages(
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the random starts.")] = 1,
     methods: Annotated[str | None, typer.Option(metavar="NAME,...", help="Methods to compare; all if absent.")] = None,
     clock_offset: ClockOffset = None,
+    plot: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Figure to write: error against length, as .png, .svg or .pdf.")
+    ] = None,
     columns: Columns = None,
     json_: Json = False,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,  # noqa: ARG001 - read by the error report
     no_progress: NoProgress = False,
@@ -256,6 +260,8 @@ def outages(
     names = [name.strip() for name in methods.split(",") if name.strip()] if methods else None
     for name in names or ():
         _method_known(name)
+    if plot is not None:
+        _writable(plot, log, force)
     found = read(log, columns=columns)
     with _working("outages", quiet or no_progress) as progress:
         result = benchmark(
@@ -267,6 +273,8 @@ def outages(
             clock_offset=clock_offset,
             progress=progress,
         )
+    if plot is not None:
+        result.plot().figure.savefig(plot)
     if json_:
         _print_json({"schema_version": SCHEMA_VERSION, "command": "outages", "log": _about(found), **result.to_dict()})
     else:
@@ -392,7 +400,7 @@ def doctor(json_: Json = False) -> int:
 
 @app.command(epilog="Example: halfwidth reproduce 003 --quick")
 def reproduce(
-    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000 or 003.")],
+    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000, 001, 003 or 004.")],
     quick: Annotated[bool, typer.Option("--quick", help="A small part of each experiment.")] = False,
     json_: Json = False,
 ) -> int:

@@ -18,6 +18,7 @@ _LIBRARIES = {
     "polars": False,
     "matplotlib": False,
     "pymap3d": False,
+    "clarabel": False,
 }
 
 

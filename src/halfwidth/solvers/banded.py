@@ -29,14 +29,19 @@ from halfwidth.array import Array
 from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.result import Status
-from halfwidth.solvers.lp import HIGHS, PIQP, Claim, Program, Solver, Verdict
+from halfwidth.solvers.lp import HIGHS, PIQP, Claim, Program, Solution, Solver, Verdict
 from halfwidth.solvers.lp import solve as proved
 from halfwidth.spread import Box
 from halfwidth.varying import Varying
 
 Point = Literal["central", "optimal", "least_squares"]
 POINTS: dict[str, int] = {"optimal": 0, "central": 1, "least_squares": 2}
-_STATUS = (Status.OK, Status.REDUCED, Status.INFEASIBLE, Status.STALLED)
+#: What the core's codes mean.
+STATUSES = (Status.OK, Status.REDUCED, Status.INFEASIBLE, Status.STALLED)
+#: Rows beyond which HiGHS, which may take minutes, is asked only where there is no other answer.
+_LONG = 500
+#: A well-centred iterate: x (T + 1, nx), theta, s, multipliers of rows, of boxes, of the ends of theta and s.
+Start = tuple[Array, Array, Array, Array, Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +175,7 @@ class Answer(NamedTuple):
     """What was found: x (T + 1, nx), theta (p0,), s (ns,), multipliers (T, nx + ny, 2), and how it went.
 
     `objective` is ``c's``; `gap` its distance from the dual objective, relative; `scale` the size of the residuals at
-    the least-squares start; `by` the solver.
+    the least-squares start; `by` the solver; `start` where a similar program may begin.
     """
 
     x: Array
@@ -184,6 +189,7 @@ class Answer(NamedTuple):
     iterations: int
     scale: float
     by: str
+    start: Start | None = None
 
 
 def solve(
@@ -195,6 +201,9 @@ def solve(
     max_iter: int = 100,
     multipliers: bool = False,
     fallback: bool = True,
+    start: Start | None = None,
+    drop: int = 0,
+    keep: bool = False,
 ) -> Answer:
     """Solve the program.
 
@@ -211,6 +220,12 @@ def solve(
         Return them too, in units of cost by residual.
     fallback : bool
         Ask the stock solvers where the core does not certify its answer.
+    start : Start, optional
+        Where an optimal point may begin: the `start` of a program of the same sizes that began `drop` rows earlier. The
+        optimum does not depend on it; where it leads nowhere the program is solved from least squares.
+    drop : int
+    keep : bool
+        Return a `start` for the next program.
 
     Returns
     -------
@@ -218,11 +233,14 @@ def solve(
         Its status is OK only with a relative gap of at most 1e-8 (or `central_gap`); INFEASIBLE only with a proof.
     """
     c = chain
-    x, theta, s, lam, slack, info = lp_solve(*_arrays(c), POINTS[point], tol, central_gap, max_iter, multipliers)
-    status = _STATUS[info["status"]]
-    answer = Answer(
-        x, theta, s, lam, slack, status, info["objective"], info["gap"], info["iterations"], info["scale"], "banded"
+    x, theta, s, lam, slack, info = lp_solve(
+        *_arrays(c), POINTS[point], tol, central_gap, max_iter, multipliers, start, drop, keep
     )
+    status = STATUSES[info["status"]]
+    answer = Answer(
+        x, theta, s, lam, slack, status, info["objective"], info["gap"], info["iterations"], info["scale"], "banded",
+        info["start"],
+    )  # fmt: skip
     if status is Status.OK or not fallback:
         return answer
     if status is Status.REDUCED and c.T > 5000:
@@ -239,31 +257,118 @@ def _arrays(c: Chain) -> tuple[Any, ...]:
 
 def _proved(chain: Chain, answer: Answer) -> Answer:
     """Return the stock solvers' answer, or the structured one's if they have none that is better."""
-    found = proved(chain.program(), (PIQP, HIGHS))
-    if found.verdict is Verdict.INFEASIBLE:
-        return answer._replace(status=Status.INFEASIBLE, by=found.solver)
-    if found.x is None or not found.solved:
-        return answer._replace(status=Status.STALLED)
-    if found.verdict is Verdict.REDUCED and answer.status is Status.REDUCED:
-        return answer
+    answer = answer._replace(start=None)
+    found: Solution | None = None
+    near = moved = _Near.of(chain, answer)
+    given = _Near.as_given(chain, answer)  # better where nothing but rounding is left to explain
+    # Half-widths without a cap can always grow, and a point that keeps within the caps has been found.
+    feasible = answer.status is Status.REDUCED or not np.isfinite(chain.cap).any()
+    value = answer.objective if answer.status is Status.REDUCED else np.inf
+    for where, solver in ((moved, PIQP), (moved, HIGHS), (given, PIQP), (given, HIGHS)):
+        if solver is HIGHS and chain.T > _LONG and value < np.inf:
+            continue
+        one = proved(where.chain.program(), (solver,))
+        if one.verdict is Verdict.INFEASIBLE and not feasible:
+            return answer._replace(status=Status.INFEASIBLE, by=one.solver)
+        best = found is not None and found.verdict is Verdict.OPTIMAL
+        lower = one.objective * where.size < value * (1.0 - 1e-9)
+        if (one.verdict is Verdict.OPTIMAL and (lower or not best)) or (one.solved and lower and not best):
+            near, found, value = where, one, one.objective * where.size
+        # An interior point's dual residual is worth more than it says where states can be large: ask for a vertex too.
+        if one.verdict is Verdict.OPTIMAL and (solver is HIGHS or chain.T > _LONG):
+            break
+    if found is None or found.x is None:
+        return answer if answer.status is Status.REDUCED else answer._replace(status=Status.STALLED)
     T, nx = chain.bx.shape
     n, p0, ns = (T + 1) * nx, len(answer.theta), len(chain.c)
-    slack = answer.slack
-    if slack is not None:
+    x, theta, s, e = np.split(found.x, [n, n + p0, n + p0 + ns])
+    s = np.clip(near.s * s, chain.floor, np.maximum(chain.cap, chain.floor))
+    slack, value = answer.slack, float(chain.c @ s)
+    if slack is not None and chain.slack is not None:
         slack = np.zeros_like(slack)
-        slack[:, :nx] = found.x[n + p0 + ns :][: T * nx].reshape(T, nx)
-        slack[:, nx:][chain.seen] = found.x[n + p0 + ns :][T * nx :]
+        slack[:, :nx] = e[: T * nx].reshape(T, nx)
+        slack[:, nx:][chain.seen] = e[T * nx :]
+        slack *= near.row
+        value += float((slack @ chain.slack).sum())
     return answer._replace(
-        x=found.x[:n].reshape(T + 1, nx),
-        theta=found.x[n : n + p0],
-        s=found.x[n + p0 : n + p0 + ns],
+        x=near.point + near.x * x.reshape(T + 1, nx),
+        theta=near.at + near.theta * theta,
+        s=s,
         multipliers=None,
         slack=slack,
         status=Status.OK if found.verdict is Verdict.OPTIMAL else Status.REDUCED,
-        objective=float(chain.c @ found.x[n + p0 : n + p0 + ns]) if slack is None else found.objective,
+        objective=value,
         gap=found.check.gap if found.check is not None else answer.gap,
         by=found.solver,
     )
+
+
+class _Near(NamedTuple):
+    """A chain measured from a point close to its optimum, in units in which all its numbers are near 1.
+
+    `x` (nx,), `theta` (p0,), `s` (ns,) and `row` (nx + ny,) are these units: states are ``point + x x'``, parameters
+    ``at + theta theta'``, residuals ``row rho'``, the objective ``size`` times its.
+    """
+
+    chain: Chain
+    point: Array
+    at: Array
+    x: Array
+    theta: Array
+    s: Array
+    row: Array
+    size: float
+
+    @classmethod
+    def of(cls, c: Chain, answer: Answer) -> "_Near":
+        """Measure a chain from an answer."""
+        (T, nx), ny = c.bx.shape, c.by.shape[1]
+        size = answer.scale if answer.scale > 0 else 1.0
+        known = np.where((c.cap > 0) & np.isfinite(c.cap), c.cap, 1.0)
+        s = size * np.where(c.c > 0, 1.0 / np.where(c.c > 0, c.c, 1.0), known)
+        row = c.h * s[c.group]
+        A, C = np.broadcast_to(c.A, (T, nx, nx)), np.broadcast_to(c.C, (T, ny, nx))
+        E = np.broadcast_to(np.eye(nx) if c.E is None else c.E, (T, nx, nx))
+        A, E, C = A / row[:nx, None], E / row[:nx, None], np.where(c.seen[:, :, None], C / row[nx:, None], 0.0)
+        x = _unit(np.concatenate([A, E, C], axis=1))
+        G = None if c.G is None else c.G / row[:, None]
+        if G is not None:
+            G = np.concatenate([G[:, :nx], np.where(c.seen[:, :, None], G[:, nx:], 0.0)], axis=1)
+        theta = np.zeros(0) if G is None else _unit(G)
+        bx = c.bx / row[:nx] - (E @ answer.x[1:, :, None] - A @ answer.x[:-1, :, None])[..., 0]
+        by = np.where(c.seen, c.by / row[nx:] - (C @ answer.x[1:, :, None])[..., 0], 0.0)
+        if G is not None:
+            bx, by = bx - G[:, :nx] @ answer.theta, by - np.where(c.seen, G[:, nx:] @ answer.theta, 0.0)
+        ends = {
+            name: None if end is None else (end - at) / unit
+            for name, end, at, unit in (
+                ("lo", c.lo, answer.x, x), ("hi", c.hi, answer.x, x),
+                ("x0_lo", c.x0_lo, answer.x[0], x), ("x0_hi", c.x0_hi, answer.x[0], x),
+                ("theta_lo", c.theta_lo, answer.theta, theta), ("theta_hi", c.theta_hi, answer.theta, theta),
+            )
+        }  # fmt: skip
+        chain = Chain(
+            A=A * x, C=C * x, E=E * x, bx=bx, by=by, seen=c.seen, group=c.group, h=np.ones(nx + ny),
+            c=np.where(c.c > 0, 1.0, 0.0), floor=c.floor / s, cap=c.cap / s, G=None if G is None else G * theta,
+            slack=None if c.slack is None else c.slack * row / size, **ends,
+        )  # fmt: skip
+        return cls(chain, answer.x, answer.theta, x, theta, s, row, size)
+
+    @classmethod
+    def as_given(cls, c: Chain, answer: Answer) -> "_Near":
+        """Leave a chain in its own units."""
+        one = np.ones(len(c.h))
+        return cls(
+            c, np.zeros_like(answer.x), np.zeros_like(answer.theta), np.ones(c.bx.shape[1]), np.ones_like(answer.theta),
+            np.ones_like(c.c), one, 1.0,
+        )  # fmt: skip
+
+
+def _unit(columns: Array) -> Array:
+    """Return what each column is multiplied by to be of size 1 in the mean row of time; columns are (T, rows, n)."""
+    norm = np.sqrt(np.square(columns).sum(axis=1).mean(axis=0))
+    fine = (norm > 1e-140) & (norm < 1e140)
+    return np.asarray(np.where(fine, 1.0 / np.where(fine, norm, 1.0), 1.0))
 
 
 @dataclass(frozen=True, eq=False)

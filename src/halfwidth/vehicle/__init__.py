@@ -10,6 +10,7 @@ from halfwidth.lazy import lazy
 
 #: Public names and the module of each, loaded when first used.
 _HOME: dict[str, str] = {
+    "Calibration": "sensors",
     "Check": "check",
     "Frame": "frames",
     "Gap": "track",
@@ -18,6 +19,7 @@ _HOME: dict[str, str] = {
     "METHODS": "estimators",
     "Outages": "outage",
     "Track": "track",
+    "calibrated": "align",
     "check": "check",
     "constant_velocity": "models",
     "ctrv": "models",
@@ -35,6 +37,7 @@ _HOME: dict[str, str] = {
 __all__ = sorted(_HOME)
 
 if TYPE_CHECKING:
+    from halfwidth.vehicle.align import calibrated as calibrated
     from halfwidth.vehicle.check import Check as Check
     from halfwidth.vehicle.check import check as check
     from halfwidth.vehicle.drive import simulate_drive as simulate_drive
@@ -53,6 +56,7 @@ if TYPE_CHECKING:
     from halfwidth.vehicle.models import two_antenna_linear as two_antenna_linear
     from halfwidth.vehicle.outage import Outages as Outages
     from halfwidth.vehicle.outage import outages as outages
+    from halfwidth.vehicle.sensors import Calibration as Calibration
     from halfwidth.vehicle.track import Gap as Gap
     from halfwidth.vehicle.track import Track as Track
 

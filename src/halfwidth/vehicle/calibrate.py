@@ -9,7 +9,8 @@ that few stretches give a wide interval and not a lucky one; each stretch counts
 as one where a sensor is missing. This is an observed frequency on this log, no guarantee.
 
 A gap in which the speed or the yaw rate is silent as well is another thing than one in which they speak: for such gaps
-they are hidden together with the fixes. Where nothing can be hidden, the standard deviation is taken `UNTESTED` times.
+they are hidden together with the fixes. What lies beyond the first or the last fix is tested by windows of the log
+whose own beginning or end is hidden. Where nothing can be hidden, the standard deviation is taken `UNTESTED` times.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +29,9 @@ MOST_LENGTHS, PHASES = 3, 3
 
 #: Fixes left between hidden stretches and at the ends, s, at least; and stretches needed for a quantile.
 BETWEEN, EDGE, FEWEST = 15.0, 3.0, 3
+
+#: Windows cut out of a log to test how far off a path gets beyond the last fix, about, and their fixes, s.
+END_WINDOWS, END_CONTEXT = 16, 30.0
 
 #: Nodes of the parts of a log that are tested, about.
 MOST_NODES = 20_000
@@ -69,6 +73,8 @@ class Tested:
         What filled the stretches.
     half_m : float
         Mean half-width at the hidden fixes with the inflation, m.
+    side : str
+        ``"both"`` where fixes stand on both sides of the stretches, ``"one"`` beyond the first or last fix.
     """
 
     length_s: float
@@ -80,6 +86,7 @@ class Tested:
     silent: tuple[str, ...] = ()
     by: str = ""
     half_m: float = 0.0
+    side: str = "both"
 
 
 def lengths_to_test(drives: Sequence[Grid], gaps: Floats) -> list[float]:
@@ -153,15 +160,15 @@ def tested(
     every = max(1, round(sum(len(drive) for drive in drives) / MOST_NODES))
     for length in lengths:
         cases = [
-            (i, *hidden)
+            (i, drive, *hidden)
             for i, drive in list(enumerate(drives))[::every]
             for phase in range(PHASES)
             if (hidden := _hidden(drive, length, phase / PHASES, silent)) is not None
         ]
         if not cases:
             continue
-        for by, paths in rerun([i for i, _, _ in cases], [grid for _, grid, _ in cases]).items():
-            one = _judged(drives, cases, paths, length, level, z, _PER_GUESS if guessed else _PER_STRETCH)
+        for by, paths in rerun([case[0] for case in cases], [case[2] for case in cases]).items():
+            one = _judged(cases, paths, length, level, z, _PER_GUESS if guessed else _PER_STRETCH)
             if one is not None:
                 found.setdefault(by, []).append(replace(one, silent=silent, by=by))
     return found
@@ -190,18 +197,80 @@ def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -
     return (drive.masked(mask, silent), stretches) if stretches else None
 
 
-def _judged(
+def tested_ends(
     drives: Sequence[Grid],
-    cases: Sequence[tuple[int, Grid, list[slice]]],
+    rerun: Callable[[Sequence[int], Sequence[Grid]], list[Path]],
+    lengths: Sequence[float],
+    level: float,
+    z: float,
+    silent: tuple[str, ...],
+    *,
+    by: str,
+) -> list[Tested]:
+    """Cut windows out of drives, hide the end or the beginning of each, and see what widening the interval needs.
+
+    A path beyond the last fix is held from one side only; no gap says how far off it gets.
+
+    Parameters
+    ----------
+    drives : sequence of Grid
+    rerun : function (indices, hidden windows) -> list of Path
+        Fills windows; `indices` says which drive each comes from.
+    lengths : sequence of float
+        How much is hidden, s.
+    level, z, silent
+        As in `tested`.
+    by : str
+        Name of what fills.
+
+    Returns
+    -------
+    list of Tested
+        One for each length that had enough windows.
+    """
+    found = []
+    for length in lengths:
+        places = [
+            (i, begin, last)
+            for i, drive in enumerate(drives)
+            for begin in _evenly(drive, length, max(2, END_WINDOWS // len(drives)))
+            for last in (True, False)
+        ]
+        cases = []
+        for i, begin, last in places[:: max(1, len(places) // END_WINDOWS)]:
+            window = drives[i].between(begin, begin + END_CONTEXT + length)
+            cut = begin + END_CONTEXT if last else begin + length
+            mask = window.t > cut if last else window.t < cut
+            hidden = window.masked(mask, silent)
+            moves = not window.has_speed or float((np.abs(window.speed) * window.h)[mask].sum()) > length
+            if window.seen[mask].any() and int(hidden.seen.sum()) > FEWEST and moves:
+                at = np.flatnonzero(mask)
+                cases.append((i, window, hidden, [slice(int(at[0]), int(at[-1]) + 1)]))
+        if len(cases) >= FEWEST:
+            paths = rerun([case[0] for case in cases], [case[2] for case in cases])
+            one = _judged(cases, paths, length, level, z, _PER_GUESS)
+            found += [] if one is None else [replace(one, silent=silent, by=by, side="one")]
+    return found
+
+
+def _evenly(drive: Grid, length: float, n: int) -> list[float]:
+    """Return the beginnings of n windows, evenly spread over the fixes of a drive."""
+    fixes = drive.t[drive.seen]
+    if fixes.size < FEWEST or fixes[-1] - fixes[0] <= END_CONTEXT + length:
+        return []
+    return [float(t) for t in np.linspace(fixes[0], fixes[-1] - END_CONTEXT - length, n)]
+
+
+def _judged(
+    cases: Sequence[tuple[int, Grid, Grid, list[slice]]],
     paths: Sequence[Path],
     length: float,
     level: float,
     z: float,
     independent: int,
 ) -> Tested | None:
-    factors, weights, means, largest, inside, halves = [], [], [], [], [], []
-    for (i, _, stretches), path in zip(cases, paths, strict=True):
-        drive = drives[i]
+    factors, means, largest, inside, halves = [], [], [], [], []
+    for (_, drive, _, stretches), path in zip(cases, paths, strict=True):
         if not path.finite or path.variance is None:
             continue
         for part in stretches:
@@ -210,7 +279,6 @@ def _judged(
             sd = np.sqrt(np.maximum(path.variance[part][seen] + path.fix_variance, 1e-12))
             needed = np.abs(error / (z * sd)).ravel()
             factors.append(needed)
-            weights.append(np.full(needed.size, 1.0 / needed.size))
             distance = np.hypot(error[:, 0], error[:, 1])
             means.append(distance.mean())
             largest.append(distance.max())
@@ -219,11 +287,7 @@ def _judged(
     n = len(factors)
     if n < FEWEST:
         return None
-    factor, weight = np.concatenate(factors), np.concatenate(weights)
-    order = np.argsort(factor)
-    share = np.cumsum(weight[order]) / n
-    at = min(int(np.searchsorted(share, min(level * (1 + 1 / (independent * n)), 1.0 - 1e-9))), factor.size - 1)
-    inflation = float(factor[order][at])
+    inflation = quantile(factors, level, independent)
     return Tested(
         length,
         n,
@@ -235,12 +299,36 @@ def _judged(
     )
 
 
+def quantile(needed: Sequence[Floats], level: float, independent: int = _PER_STRETCH) -> float:
+    """Return the factor that covers a share of the hidden fixes, each stretch counting the same.
+
+    Parameters
+    ----------
+    needed : sequence of arrays
+        For each stretch the factors that just reach its fixes.
+    level : float
+        Wanted share.
+    independent : int
+        Errors of one stretch that count as independent.
+
+    Returns
+    -------
+    float
+    """
+    n = len(needed)
+    factor = np.concatenate(needed)
+    weight = np.concatenate([np.full(one.size, 1.0 / max(one.size, 1)) for one in needed])
+    order = np.argsort(factor)
+    share = np.cumsum(weight[order]) / n
+    at = min(int(np.searchsorted(share, min(level * (1 + 1 / (independent * n)), 1.0 - 1e-9))), factor.size - 1)
+    return float(factor[order][at])
+
+
 def inflation(found: Sequence[Tested], length: Floats, *, least: float = 1.0) -> Floats:
     """Return the factor on the standard deviation for gaps of these lengths.
 
     Between tested lengths it is interpolated in the logarithm of the length; beyond them the nearest counts. Below
-    `least` it is not taken: a model that was too wide on the log's easy stretches is left as it is. Without a test
-    it is `UNTESTED`.
+    `least` it is not taken. Without a test it is `UNTESTED`.
 
     Parameters
     ----------

@@ -1,24 +1,31 @@
 """The chain that fills gaps: dead reckoning between fixes, with all noise scales learnt from the drive itself.
 
-The state is z = [east, north, azimuth, offset east, offset north, speed scale, yaw bias]. A step of h seconds with
-measured speed v and yaw rate w moves along the azimuth in its middle, S its sine and C its cosine:
+The state is z = [east, north, azimuth, offset east, offset north, speed scale, yaw bias, drift east, drift north]. A
+step of h seconds with measured speed v and yaw rate w moves along the azimuth in its middle, S its sine and C its
+cosine:
 
 ==============  =======================================================  ==========================================
 group           residual                                                 standard deviation
 ==============  =======================================================  ==========================================
 longitudinal    S dE + C dN - scale v h                                  sigma_1 sqrt(h max(min(1, abs v), 0.02))
 lateral         C dE - S dN (a car does not move sideways)               sigma_2 sqrt(h) max(abs v, 0.05)
-yaw             d azimuth + h (w - bias)                                 sigma_3 sqrt(h), a tenth below 0.1 m/s
-fix offset      offset[k] - exp(-h / 60 s) offset[k-1], both axes        sigma_4 sqrt(h)
-fix             E + offset E - fix E, and north                          sigma_5
+slip            part of the same residual: in turns it does              sigma_3 sqrt(h) abs(v w)
+yaw             d azimuth + h (w - bias)                                 sigma_4 sqrt(h), a tenth below 0.1 m/s
+fix offset      offset[k] - exp(-h / 60 s) offset[k-1] - h drift[k-1]    sigma_5 sqrt(h), heavy-tailed
+fix drift       drift[k] - exp(-h / 10 s) drift[k-1], both axes          sigma_6 sqrt(h)
+fix             E + offset E - fix E, and north                          sigma_7
 ==============  =======================================================  ==========================================
 
 Scale and bias are nearly constant: increments of 1e-4 and 1e-5 rad/s per root second, priors 1 +- 0.03 and
-0 +- 0.01 rad/s. The offset is what a receiver is wrong by for a minute at a time; without it the path would start a
-whole fix error off at the edge of a gap.
+0 +- 0.01 rad/s. What a receiver is wrong by is mostly no white noise: it is an offset that lasts for a minute
+(without it the path would start a whole fix error off at the edge of a gap), that drifts for some seconds at a time
+(the receiver's own filter, reflections that come and go) and that jumps (a correction arrives, a satellite is lost).
+The jumps are why increments of the offset have Student's distribution: each has its own weight, learnt with the
+scales (Lange, Little and Taylor 1989). In a gap, where nothing tells which increments are jumps, all have the mean
+square of those outside.
 
 The residuals are solved for the new state, which makes a linear model ``z[k] = A z[k-1] + b + w`` whose noise is
-rotated with the car: a Rauch-Tung-Striebel smoother (the core's) gives the path, and the five scales are the means of
+rotated with the car: a Rauch-Tung-Striebel smoother (the core's) gives the path, and the scales are the means of
 posterior squared residuals (expectation maximisation, Shumway and Stoffer 1982). Each round re-linearises about its
 own path first. Many drives (outages of one log) are solved side by side.
 
@@ -27,7 +34,7 @@ is taken as 0 and the scale of the yaw residual learns how much the car turns.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,24 +43,30 @@ from halfwidth import _core
 from halfwidth.result import Status
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
+from halfwidth.vehicle.pointing import azimuth_of, with_speed
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: Names of the five learnt scales, in order.
-GROUPS: tuple[str, ...] = ("longitudinal", "lateral", "yaw", "offset", "fix")
+#: Names of the learnt scales, in order.
+GROUPS: tuple[str, ...] = ("longitudinal", "lateral", "slip", "yaw", "offset", "drift", "fix")
 
 #: Where learning starts: standard deviations in the units of the table above.
-_START = np.array([0.1, 0.05, 0.01, 0.3, 0.3])
+_START = np.array([0.1, 0.05, 0.05, 0.01, 0.3, 0.1, 0.3])
 
 #: A scale is not believed below the first or above the second.
-_FLOOR = np.array([1e-3, 1e-4, 1e-5, 1e-4, 3e-3])
-_CEILING = np.array([30.0, 3.0, 3.0, 30.0, 1e3])
+_FLOOR = np.array([1e-3, 1e-4, 1e-4, 1e-5, 1e-4, 1e-4, 3e-3])
+_CEILING = np.array([30.0, 3.0, 30.0, 3.0, 30.0, 30.0, 1e3])
+
+LONGITUDINAL, LATERAL, SLIP, YAW, OFFSET, DRIFT, FIX = range(7)
 
 #: Rows of all drives that are solved side by side at most, but for a single longer drive.
 _BATCH = 20_000
 
-E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS = range(7)
+E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS, DRIFT_E, DRIFT_N = range(9)
+
+#: Number of states.
+SIZE = 9
 
 
 @dataclass(frozen=True)
@@ -64,8 +77,12 @@ class Chain:
     ----------
     rounds : int
         Rounds of re-linearising, smoothing and learning.
-    memory : float
-        Time constant of the fix offset, s.
+    memory, drift_memory : float
+        Time constants of the fix offset and of its drift, s.
+    tail : float
+        Degrees of freedom of the increments of the offset; infinite makes them Gaussian.
+    slow, drifting : bool
+        Whether fixes have an offset at all, and whether it drifts. Without an offset they are wrong by white noise.
     scale_sd, bias_sd : float
         Prior standard deviations of the speed scale and of the yaw bias, rad/s.
     scale_walk, bias_walk : float
@@ -74,10 +91,19 @@ class Chain:
 
     rounds: int = 24
     memory: float = 60.0
+    drift_memory: float = 10.0
+    tail: float = 4.0
+    slow: bool = True
+    drifting: bool = True
     scale_sd: float = 0.03
     bias_sd: float = 0.01
     scale_walk: float = 1e-4
     bias_walk: float = 1e-5
+
+    @property
+    def learns(self) -> Mask:
+        """(7,) array: whether each scale is learnt; the others stay at their least."""
+        return np.array([True] * OFFSET + [self.slow, self.slow and self.drifting, True])
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,16 +112,19 @@ class Fit:
 
     Parameters
     ----------
-    sigma : (5,) array
+    sigma : (7,) array
         The learnt scales, in the order of `GROUPS`.
-    z, P : (T, 7) and (T, 7, 7) arrays
+    weight : (T,) array
+        Weight of the increment of the offset before each node: below 1 where it is taken for a jump.
+    z, P : (T, 9) and (T, 9, 9) arrays
         Posterior mean and covariance of the states.
     loglik : float
-        Log-likelihood of the fixes.
+        Log-likelihood of the fixes, given the weights.
     path : Path
     """
 
     sigma: Floats
+    weight: Floats = field(repr=False)
     z: Floats = field(repr=False)
     P: Floats = field(repr=False)
     loglik: float
@@ -108,6 +137,7 @@ def solve(
     *,
     sigma: Floats | None = None,
     azimuth: Sequence[Floats] | None = None,
+    weight: Sequence[Floats] | None = None,
     learn: bool = True,
 ) -> list[Fit]:
     """Solve the chain for several drives side by side.
@@ -117,142 +147,66 @@ def solve(
     drives : sequence of Grid
         Each with at least two nodes and one fix.
     settings : Chain
-    sigma : (5,) or (n, 5) array, optional
+    sigma : (7,) or (n, 7) array, optional
         Scales to start from, or to keep.
     azimuth : sequence of (T,) arrays, optional
         Azimuths to linearise about first; `azimuth_of` each drive if absent.
+    weight : sequence of (T,) arrays, optional
+        Weights of the increments of the offset to start from; 1 if absent.
     learn : bool
-        Whether the scales are learnt; else the rounds only re-linearise.
+        Whether the scales are learnt; else the rounds only re-linearise and weight.
 
     Returns
     -------
     list of Fit
         With ``path.status`` STALLED where the numbers broke down; such a path is not to be used.
     """
-    start = np.broadcast_to(_START if sigma is None else sigma, (len(drives), 5))
-    first = [None] * len(drives) if azimuth is None else list(azimuth)
+    start = np.broadcast_to(_START if sigma is None else sigma, (len(drives), len(GROUPS)))
+    azimuths = [None] * len(drives) if azimuth is None else list(azimuth)
+    weights = [None] * len(drives) if weight is None else list(weight)
     fits: list[Fit] = []
     # so many at a time that a day of driving fits into memory
     rows = np.cumsum([len(drive) for drive in drives])
     for batch in np.unique(rows // _BATCH):
         which = np.flatnonzero(rows // _BATCH == batch).tolist()
         fits += _solved(
-            [_with_speed(drives[i]) for i in which], settings, start[which], [first[i] for i in which], learn
+            [with_speed(drives[i]) for i in which],
+            settings,
+            start[which],
+            [azimuths[i] for i in which],
+            [weights[i] for i in which],
+            learn,
         )
     return fits
 
 
 def _solved(
-    drives: Sequence[Grid], settings: Chain, sigma: Floats, azimuth: Sequence[Floats | None], learn: bool
+    drives: Sequence[Grid],
+    settings: Chain,
+    sigma: Floats,
+    azimuth: Sequence[Floats | None],
+    weight: Sequence[Floats | None],
+    learn: bool,
 ) -> list[Fit]:
     rows = _rows(drives)
     given = zip(drives, azimuth, strict=True)
     psi = np.concatenate([azimuth_of(drive) if first is None else first for drive, first in given])
-    s2 = sigma**2
+    own = zip(drives, weight, strict=True)
+    share = np.concatenate([np.ones(len(drive)) if first is None else first for drive, first in own])
+    learns = settings.learns
+    s2 = np.where(learns, sigma, _FLOOR) ** 2
     for k in range(settings.rounds):
         line = _linearised(rows, psi)
-        out = _smoothed(rows, line, s2, settings)
+        out = _smoothed(rows, line, s2, share, settings)
         found = out.x[:, AZIMUTH]
         psi = np.where(np.isfinite(found), found, psi)
-        if learn and k < settings.rounds - 1:
-            s2 = _learnt(rows, line, out, s2)
-    return [_fit(rows, out, s2[i], i, drive, settings) for i, drive in enumerate(drives)]
-
-
-def azimuth_of(drive: Grid) -> Floats:
-    """Return a first azimuth: the integrated yaw rate, turned to where fixes and courses point.
-
-    The turn is a smooth function of time, so that a yaw bias of a few hundredths of a rad/s is absorbed.
-
-    Parameters
-    ----------
-    drive : Grid
-
-    Returns
-    -------
-    (T,) array
-        Radians, clockwise from north, continuous.
-    """
-    if not drive.has_yaw_rate:
-        return _direction(drive)
-    t, h = drive.t, drive.h
-    turned = np.concatenate(([0.0], np.cumsum(-(drive.yaw_rate * h)[1:])))
-    seen = np.flatnonzero(drive.seen)
-    # displacements over about two seconds: short enough to be straight, long enough to stand out of the noise
-    stride = max(1, round(2.0 / max(float(np.median(np.diff(t[seen]))), 1e-3))) if seen.size > 1 else 1
-    a, b = seen[:-stride], seen[stride:]
-    near = t[b] - t[a] <= 2.0 * 2.0 + 1e-9
-    a, b = a[near], b[near]
-    moved = (drive.north[b] - drive.north[a]) + 1j * (drive.east[b] - drive.east[a])
-    weight = np.abs(moved) if not drive.has_speed else np.abs(drive.speed[b]) * (t[b] - t[a])
-    pointing = moved * weight * np.exp(-0.5j * (turned[a] + turned[b]))
-    when = 0.5 * (t[a] + t[b])
-    given = np.flatnonzero(np.isfinite(drive.course))
-    straight = (2.0 * np.maximum(np.abs(drive.speed[given]), 1.0)) ** 2 * np.exp(
-        1j * (drive.course[given] - turned[given])
-    )
-    when = np.concatenate((when, t[given]))
-    pointing = np.concatenate((pointing, straight))
-    if when.size == 0 or not np.any(pointing):
-        return turned
-    knots = np.linspace(t[0], t[-1], max(2, min(400, int((t[-1] - t[0]) / 5.0) + 2)))
-    near2 = ((knots[:, None] - when) / 15.0) ** 2
-    # far from all data the nearest one decides: the exponent is taken relative to the best of each knot
-    turn = np.exp(-0.5 * (near2 - near2.min(axis=1, keepdims=True))) @ pointing
-    first: Floats = turned + np.interp(t, knots, np.unwrap(np.angle(turn)))
-    return first
-
-
-def _secants(drive: Grid) -> tuple[Floats, Floats, NDArray[np.complex128]]:
-    """Return middle times, lengths in time and displacements (north + i east) between fixes about a second apart."""
-    seen = np.flatnonzero(drive.seen)
-    t = drive.t[seen]
-    if seen.size < 2:
-        return np.empty(0), np.empty(0), np.empty(0, dtype=complex)
-    stride = max(1, round(1.0 / max(float(np.median(np.diff(t))), 1e-3)))
-    stride = min(stride, seen.size - 1)
-    a, b = seen[:-stride], seen[stride:]
-    took = drive.t[b] - drive.t[a]
-    near = took <= max(3.0, 1.5 * float(np.median(took)))
-    a, b, took = a[near], b[near], took[near]
-    moved = (drive.north[b] - drive.north[a]) + 1j * (drive.east[b] - drive.east[a])
-    return 0.5 * (drive.t[a] + drive.t[b]), took, moved
-
-
-def _direction(drive: Grid) -> Floats:
-    """Return an azimuth without a yaw rate: the direction in which the fixes move, turning evenly between them."""
-    when, _, moved = _secants(drive)
-    far = np.abs(moved) > 0.5
-    if not far.any():
-        return np.zeros(len(drive))
-    turning: Floats = np.interp(drive.t, when[far], np.unwrap(np.angle(moved[far])))
-    return turning
-
-
-def _with_speed(drive: Grid) -> Grid:
-    """Give a drive without a speed sensor the speed of its fixes, changing evenly where there are none.
-
-    Where no fix is near, the guess may be off by 0.7 m/s for each second to the next one, at most by 5 m/s.
-    """
-    if drive.has_speed:
-        return drive
-    when, took, moved = _secants(drive)
-    if when.size == 0:
-        return replace(drive, speed_sd=np.full(len(drive), 5.0), has_speed=True)
-    h = drive.h
-    middle = drive.t - 0.5 * h
-    k = np.searchsorted(when, middle)
-    before, after = when[np.maximum(k - 1, 0)], when[np.minimum(k, when.size - 1)]
-    outside = (k == 0) | (k == when.size)
-    far = np.where(
-        outside, np.abs(middle - np.where(k == 0, after, before)), np.minimum(middle - before, after - middle)
-    )
-    pause = np.where(outside, 2 * far, after - before)
-    sd = np.minimum(0.7 * far, 5.0) * np.sqrt(np.maximum(pause / h, 1.0))
-    lost = pause > 1.5 * float(np.median(took))
-    return replace(
-        drive, speed=np.interp(middle, when, np.abs(moved) / took), speed_sd=np.where(lost, sd, 0.0), has_speed=True
-    )
+        if k < settings.rounds - 1:
+            squares = _squares(rows, line, out)
+            if settings.slow and np.isfinite(settings.tail):
+                share = _shares(rows, squares[:, OFFSET], s2, settings.tail)
+            if learn:
+                s2 = np.where(learns, _learnt(rows, squares, share, out, s2), s2)
+    return [_fit(rows, out, s2[i], share, i, drive, settings) for i, drive in enumerate(drives)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,8 +219,9 @@ class _Rows:
     h: Floats
     v: Floats
     w: Floats
-    weight2: Floats  # (R, 3) squared weights of the first three groups
-    extra: Floats  # (R, 3) variance added to them where a sensor was silent
+    weight2: Floats  # (R, 4) squared weights of the first four groups
+    extra: Floats  # (R, 3) variance added to longitudinal, lateral and yaw where a sensor was silent
+    gap: Mask  # (R,) whether the step lies in a gap between fixes
     y: Floats  # (R, 2) fixes, about the first of each drive
     seen: Mask  # (R, 2)
     origin: Floats  # (n, 2)
@@ -287,7 +242,12 @@ def _rows(drives: Sequence[Grid]) -> _Rows:
     pace = np.abs(v)
     still = (pace < 0.1) & np.repeat([drive.has_yaw_rate for drive in drives], sizes)
     weight2 = np.column_stack(
-        (h * np.maximum(np.minimum(1.0, pace), 0.02), h * np.maximum(pace, 0.05) ** 2, h * np.where(still, 0.01, 1.0))
+        (
+            h * np.maximum(np.minimum(1.0, pace), 0.02),
+            h * np.maximum(pace, 0.05) ** 2,
+            h * (pace * w) ** 2,
+            h * np.where(still, 0.01, 1.0),
+        )
     )
     # a step of unknown speed may also slide: without this the lateral row would trust a wrong displacement
     lost_speed, lost_yaw = h * joined("speed_sd"), h * joined("yaw_rate_sd")
@@ -300,15 +260,26 @@ def _rows(drives: Sequence[Grid]) -> _Rows:
         far[i] = 100.0 + 2.0 * float(np.sum((np.abs(drive.speed) * drive.h)[1 : k + 1]))
     y = np.column_stack((joined("east"), joined("north"))) - origin[index]
     y[~seen] = 0.0
-    return _Rows(offsets, index, first, h, v, w, weight2, extra, y, np.column_stack((seen, seen)), origin, far)
+    gap = np.concatenate([_in_gap(drive) for drive in drives])
+    return _Rows(offsets, index, first, h, v, w, weight2, extra, gap, y, np.column_stack((seen, seen)), origin, far)
+
+
+def _in_gap(drive: Grid) -> Mask:
+    """Return the steps between fixes much further apart than usual, and before the first and after the last."""
+    seen = np.flatnonzero(drive.seen)
+    after = np.searchsorted(seen, np.arange(len(drive)))
+    apart = np.concatenate(([np.inf], np.diff(drive.t[seen]), [np.inf]))
+    usual = float(np.median(apart[1:-1])) if seen.size > 1 else np.inf
+    gap: Mask = apart[after] > 1.5 * usual
+    return gap
 
 
 @dataclass(frozen=True, eq=False)
 class _Line:
     """The linear model about one azimuth: ``z[k] = A z[k-1] + b + w``."""
 
-    A: Floats  # (R, 7, 7)
-    b: Floats  # (R, 7)
+    A: Floats  # (R, 9, 9)
+    b: Floats  # (R, 9)
     S: Floats  # (R,) sine and cosine of the middle azimuth
     C: Floats
     half: Floats  # (R,) v h / 2
@@ -321,20 +292,20 @@ def _linearised(rows: _Rows, psi: Floats) -> _Line:
     middle[1:] = 0.5 * (psi[1:] + psi[:-1])
     middle[rows.first] = psi[rows.first]
     S, C, vh = np.sin(middle), np.cos(middle), v * h
-    A = np.zeros((h.size, 7, 7))
-    A[:, range(7), range(7)] = 1.0
+    A = np.zeros((h.size, SIZE, SIZE))
+    A[:, range(SIZE), range(SIZE)] = 1.0
     A[:, E, AZIMUTH], A[:, E, SCALE], A[:, E, BIAS] = C * vh, S * vh, 0.5 * C * vh * h
     A[:, N, AZIMUTH], A[:, N, SCALE], A[:, N, BIAS] = -S * vh, C * vh, -0.5 * S * vh * h
     A[:, AZIMUTH, BIAS] = h
     aside = vh * (-0.5 * h * w - middle)
-    b = np.zeros((h.size, 7))
+    b = np.zeros((h.size, SIZE))
     b[:, E], b[:, N], b[:, AZIMUTH] = C * aside, -S * aside, -h * w
-    A[rows.first] = np.eye(7)
+    A[rows.first] = np.eye(SIZE)
     b[rows.first] = 0.0
     return _Line(A, b, S, C, 0.5 * vh)
 
 
-_OUT = np.zeros((2, 7))
+_OUT = np.zeros((2, SIZE))
 _OUT[0, [E, OFFSET_E]] = _OUT[1, [N, OFFSET_N]] = 1.0
 
 
@@ -342,46 +313,50 @@ _OUT[0, [E, OFFSET_E]] = _OUT[1, [N, OFFSET_N]] = 1.0
 class _Smoothed:
     """What the core returns, one drive below the other."""
 
-    x: Floats  # (R, 7)
-    P: Floats  # (R, 7, 7)
-    W: Floats  # (R, 7, 7) expected squares of the state noise, given all fixes
+    x: Floats  # (R, 9)
+    P: Floats  # (R, 9, 9)
+    W: Floats  # (R, 9, 9) expected squares of the state noise, given all fixes
     V: Floats  # (n, 2, 2) their sums of the output noise
     counted: Floats  # (n,) and counts
     loglik: Floats  # (n,)
     code: NDArray[np.int64]  # (n,)
 
 
-def _smoothed(rows: _Rows, line: _Line, s2: Floats, settings: Chain) -> _Smoothed:
-    """Run the smoother of the core over all drives; s2 (n, 5) are squared scales."""
+def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Chain) -> _Smoothed:
+    """Run the smoother of the core over all drives; s2 (n, 7) are squared scales, share (R,) weights of increments."""
     h, n = rows.h, len(rows.origin)
-    fade = np.exp(-h / settings.memory)
     A = line.A.copy()
     inner = ~rows.first
-    A[inner, OFFSET_E, OFFSET_E] = A[inner, OFFSET_N, OFFSET_N] = fade[inner]
+    fade, drift_fade = np.exp(-h / settings.memory)[inner], np.exp(-h / settings.drift_memory)[inner]
+    A[inner, OFFSET_E, OFFSET_E] = A[inner, OFFSET_N, OFFSET_N] = fade
+    A[inner, OFFSET_E, DRIFT_E] = A[inner, OFFSET_N, DRIFT_N] = h[inner]
+    A[inner, DRIFT_E, DRIFT_E] = A[inner, DRIFT_N, DRIFT_N] = drift_fade
     own = s2[rows.drive]
-    d = own[:, :3] * rows.weight2 + rows.extra
+    along, aside, yaw = _variances(rows, own)
     # the noise of the rotated residuals, in the axes of the state
-    across = d[:, 1] + line.half**2 * d[:, 2]
-    Q = np.zeros((h.size, 7, 7))
+    across = aside + line.half**2 * yaw
+    Q = np.zeros((h.size, SIZE, SIZE))
     S, C = line.S, line.C
-    Q[:, E, E] = S * S * d[:, 0] + C * C * across
-    Q[:, N, N] = C * C * d[:, 0] + S * S * across
-    Q[:, E, N] = Q[:, N, E] = S * C * (d[:, 0] - across)
-    Q[:, E, AZIMUTH] = Q[:, AZIMUTH, E] = C * line.half * d[:, 2]
-    Q[:, N, AZIMUTH] = Q[:, AZIMUTH, N] = -S * line.half * d[:, 2]
-    Q[:, AZIMUTH, AZIMUTH] = d[:, 2]
-    Q[:, OFFSET_E, OFFSET_E] = Q[:, OFFSET_N, OFFSET_N] = own[:, 3] * h
+    Q[:, E, E] = S * S * along + C * C * across
+    Q[:, N, N] = C * C * along + S * S * across
+    Q[:, E, N] = Q[:, N, E] = S * C * (along - across)
+    Q[:, E, AZIMUTH] = Q[:, AZIMUTH, E] = C * line.half * yaw
+    Q[:, N, AZIMUTH] = Q[:, AZIMUTH, N] = -S * line.half * yaw
+    Q[:, AZIMUTH, AZIMUTH] = yaw
+    Q[:, OFFSET_E, OFFSET_E] = Q[:, OFFSET_N, OFFSET_N] = own[:, OFFSET] * h / share
+    Q[:, DRIFT_E, DRIFT_E] = Q[:, DRIFT_N, DRIFT_N] = own[:, DRIFT] * h
     Q[:, SCALE, SCALE] = settings.scale_walk**2 * h
     Q[:, BIAS, BIAS] = settings.bias_walk**2 * h
     Q[rows.first] = 0.0
     start = rows.offsets[:-1]
-    x0, P0 = np.zeros((n, 7)), np.zeros((n, 7, 7))
+    x0, P0 = np.zeros((n, SIZE)), np.zeros((n, SIZE, SIZE))
     x0[:, SCALE] = 1.0
     x0[:, AZIMUTH] = np.arctan2(S[start], C[start])
-    stationary = 0.5 * settings.memory * s2[:, 3]
+    offset, drift = _stationary(s2, settings)
     P0[:, E, E] = P0[:, N, N] = rows.far**2
     P0[:, AZIMUTH, AZIMUTH] = 10.0
-    P0[:, OFFSET_E, OFFSET_E] = P0[:, OFFSET_N, OFFSET_N] = stationary
+    P0[:, OFFSET_E, OFFSET_E] = P0[:, OFFSET_N, OFFSET_N] = offset
+    P0[:, DRIFT_E, DRIFT_E] = P0[:, DRIFT_N, DRIFT_N] = drift
     P0[:, SCALE, SCALE], P0[:, BIAS, BIAS] = settings.scale_sd**2, settings.bias_sd**2
     # one drive at a time: the sums of the core are kept for each row of Q, so they cannot be shared between drives
     parts = []
@@ -394,7 +369,7 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, settings: Chain) -> _Smoothe
                 None,
                 _OUT,
                 Q[part],
-                s2[i, 4] * np.eye(2),
+                s2[i, FIX] * np.eye(2),
                 rows.y[part],
                 rows.seen[part],
                 x0[i],
@@ -409,41 +384,83 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, settings: Chain) -> _Smoothe
     )
 
 
-def _learnt(rows: _Rows, line: _Line, out: _Smoothed, s2: Floats) -> Floats:
-    """Return the squared scales (n, 5): means of posterior squared residuals over squared weights.
+def _variances(rows: _Rows, own: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the variances (R,) of the longitudinal, lateral and yaw residuals; own (R, 7) are squared scales."""
+    d = own[:, : YAW + 1] * rows.weight2
+    return d[:, 0] + rows.extra[:, 0], d[:, LATERAL] + d[:, SLIP] + rows.extra[:, 1], d[:, YAW] + rows.extra[:, 2]
 
-    Rows where a sensor was silent are left out. One pseudo-row at the present value keeps a short drive from learning
-    that it has no noise.
-    """
+
+def _stationary(s2: Floats, settings: Chain) -> tuple[Floats, Floats]:
+    """Return the variances of offset and drift of fixes over a long time; s2 (..., 7) are squared scales."""
+    m, d = settings.memory, settings.drift_memory
+    drift = 0.5 * d * s2[..., DRIFT]
+    return 0.5 * m * s2[..., OFFSET] + drift * m * m * d / (m + d), drift
+
+
+def _squares(rows: _Rows, line: _Line, out: _Smoothed) -> Floats:
+    """Return posterior squared residuals (R, 6) over their squared weights; of the lateral one before it is shared."""
     W, S, C, c = out.W, line.S, line.C, line.half
-    squares = np.empty((rows.h.size, 4))
+    squares = np.empty((rows.h.size, 6))
     squares[:, 0] = S * S * W[:, E, E] + 2 * S * C * W[:, E, N] + C * C * W[:, N, N]
-    squares[:, 1] = (
+    squares[:, LATERAL] = (
         C * C * W[:, E, E]
         - 2 * S * C * W[:, E, N]
         + S * S * W[:, N, N]
         - 2 * c * (C * W[:, E, AZIMUTH] - S * W[:, N, AZIMUTH])
         + c * c * W[:, AZIMUTH, AZIMUTH]
     )
-    squares[:, 2] = W[:, AZIMUTH, AZIMUTH]
-    squares[:, :3] /= rows.weight2
-    squares[:, 3] = 0.5 * (W[:, OFFSET_E, OFFSET_E] + W[:, OFFSET_N, OFFSET_N]) / rows.h
-    used = np.ones((rows.h.size, 4), dtype=bool)
-    used[:, :3] = rows.extra == 0
-    used[rows.first] = False
+    squares[:, SLIP] = squares[:, LATERAL]
+    squares[:, YAW] = W[:, AZIMUTH, AZIMUTH]
+    squares[:, [0, YAW]] /= rows.weight2[:, [0, YAW]]
+    squares[:, OFFSET] = 0.5 * (W[:, OFFSET_E, OFFSET_E] + W[:, OFFSET_N, OFFSET_N]) / rows.h
+    squares[:, DRIFT] = 0.5 * (W[:, DRIFT_E, DRIFT_E] + W[:, DRIFT_N, DRIFT_N]) / rows.h
+    return np.maximum(squares, 0.0)
+
+
+def _shares(rows: _Rows, square: Floats, s2: Floats, tail: float) -> Floats:
+    """Return the weights (R,) of the increments of the offset from their mean squares of an axis."""
+    scale = s2[rows.drive, OFFSET]
+    share = (tail + 2.0) / (tail + 2.0 * square / scale)
     n = len(rows.origin)
-    new = np.empty((n, 5))
-    for g in range(4):
-        keep = used[:, g] & np.isfinite(squares[:, g])
-        total = np.bincount(rows.drive[keep], np.maximum(squares[keep, g], 0.0), n)
-        new[:, g] = (total + s2[:, g]) / (np.bincount(rows.drive[keep], minlength=n) + 1.0)
+    known = ~rows.gap & ~rows.first & np.isfinite(square)
+    count = np.bincount(rows.drive[known], minlength=n)
+    mean = np.bincount(rows.drive[known], square[known], n) / np.maximum(count, 1)
+    # where fixes are too rare to tell, an increment is as large as Student's distribution makes it
+    usual = np.where(count > 0, s2[:, OFFSET] / np.maximum(mean, 1e-12), max(1.0 - 2.0 / tail, 0.1))
+    return np.clip(np.where(rows.gap, usual[rows.drive], np.where(np.isfinite(share), share, 1.0)), 1e-6, 1e6)
+
+
+def _learnt(rows: _Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Floats) -> Floats:
+    """Return the squared scales (n, 7): means of posterior squared residuals over squared weights.
+
+    Rows where a sensor was silent are left out. One pseudo-row at the present value keeps a short drive from learning
+    that it has no noise. The lateral residual is shared between its two groups by their present variances.
+    """
+    own = s2[rows.drive]
+    parts = own[:, [LATERAL, SLIP]] * rows.weight2[:, [LATERAL, SLIP]]
+    whole = parts.sum(axis=1)
+    n = len(rows.origin)
+    new = s2.copy()
+    for g, sensor in ((LONGITUDINAL, 0), (LATERAL, 1), (SLIP, 1), (YAW, 2), (OFFSET, -1), (DRIFT, -1)):
+        keep = ~rows.first & np.isfinite(squares[:, g])
+        if sensor >= 0:
+            keep &= rows.extra[:, sensor] == 0
+        of = rows.drive[keep]
+        counted = np.ones(of.size)
+        value = squares[keep, g]
+        if g in (LATERAL, SLIP):
+            counted = parts[keep, g - LATERAL] / whole[keep]
+            value = counted * own[keep, g] * value / whole[keep]
+        elif g == OFFSET:
+            value = value * share[keep]
+        new[:, g] = (np.bincount(of, value, n) + s2[:, g]) / (np.bincount(of, counted, n) + 1.0)
     V = out.V
-    new[:, 4] = (0.5 * (V[:, 0, 0] + V[:, 1, 1]) + s2[:, 4]) / (out.counted + 1.0)
+    new[:, FIX] = (0.5 * (V[:, 0, 0] + V[:, 1, 1]) + s2[:, FIX]) / (out.counted + 1.0)
     new = np.where(np.isfinite(new), new, s2)
     return np.clip(new, _FLOOR**2, _CEILING**2)
 
 
-def _fit(rows: _Rows, out: _Smoothed, s2: Floats, i: int, drive: Grid, settings: Chain) -> Fit:
+def _fit(rows: _Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain) -> Fit:
     part = slice(int(rows.offsets[i]), int(rows.offsets[i + 1]))
     z, P = out.x[part].copy(), out.P[part]
     z[:, [E, N]] += rows.origin[i]
@@ -458,7 +475,7 @@ def _fit(rows: _Rows, out: _Smoothed, s2: Floats, i: int, drive: Grid, settings:
         "sigma": dict(zip(GROUPS, (float(s) for s in sigma), strict=True)),
         "speed_scale": float(np.mean(z[:, SCALE])),
         "yaw_bias": float(np.mean(z[:, BIAS])),
-        "slow_sd": float(np.sqrt(0.5 * settings.memory * s2[3])),
+        "slow_sd": float(np.sqrt(_stationary(s2, settings)[0])) if settings.slow else 0.0,
     }
     path = Path(
         drive.t,
@@ -467,11 +484,11 @@ def _fit(rows: _Rows, out: _Smoothed, s2: Floats, i: int, drive: Grid, settings:
         z[:, AZIMUTH],
         speed,
         np.maximum(variance, 0.0) if sound else variance,
-        float(s2[4]),
+        float(s2[FIX]),
         Status.STALLED if broken else Status.OK,
         info,
     )
-    return Fit(sigma, z, P, float(out.loglik[i]), path)
+    return Fit(sigma, share[part].copy(), z, P, float(out.loglik[i]), path)
 
 
 #: The core's code for a belief that left the range of floating point.

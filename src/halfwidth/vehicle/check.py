@@ -5,13 +5,16 @@ times against themselves, values against what a car does. What the log cannot te
 checked, never guessed.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth.vehicle import evidence
+from halfwidth.vehicle import check_sensors, evidence
+from halfwidth.vehicle.align import calibrated, steps_of
+from halfwidth.vehicle.check_sensors import Item as Item
 from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.log import STREAMS, Log
 from halfwidth.vehicle.repair import (
@@ -37,9 +40,6 @@ _COARSE = {
     "ay_mps2": (0.2, "m/s2", "0.2 m/s2"),
 }
 
-#: Slower than this the car stands (m/s).
-_STANDING = 0.1
-
 _LABEL = {
     "position": "position",
     "alt_m": "height",
@@ -54,45 +54,6 @@ _UNIT_AS_TYPED = {"speed is in km/h": "km/h", "speed is in mph": "mph", "speed i
                   "speed is in m/s, not km/h": "m/s", "speed is in cm/s": "cm/s",
                   "time is in milliseconds": "ms", "time is in microseconds": "us",
                   "time is in nanoseconds": "ns"}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Item:
-    """One point of a check.
-
-    Attributes
-    ----------
-    name : str
-        What was looked at.
-    verdict : str
-        ``"ok"``, ``"warn"``, ``"bad"`` or ``"not checked"``.
-    sentence : str
-        What was found, in words.
-    value : float or None
-        The number it rests on.
-    unit : str
-        Its unit, empty for a ratio.
-    line : str
-        What to type, empty where there is nothing to do.
-    """
-
-    name: str
-    verdict: str
-    sentence: str
-    value: float | None = None
-    unit: str = ""
-    line: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Give the point as plain data."""
-        return {
-            "name": self.name,
-            "verdict": self.verdict,
-            "sentence": self.sentence,
-            "value": self.value,
-            "unit": self.unit,
-            "line": self.line or None,
-        }
 
 
 @dataclass(frozen=True)
@@ -198,9 +159,15 @@ def check(log: Any) -> Check:
     swapped = _swapped(log)
     if swapped.verdict == "bad":
         first = "put latitude and longitude right first"
-        moving = tuple(Item(name, "not checked", first) for name in ("outliers", "speed", "azimuth", "yaw rate"))
+        names = ("outliers", "speed", "azimuth", "yaw rate", "trust", *check_sensors.NAMES)
+        moving = [Item(name, "not checked", first) for name in names]
     else:
-        moving = (_outliers(log), _speed(log), _azimuth(log), _yaw(log))
+        moving = [_outliers(log), _speed(log), _azimuth(log), _yaw(log), _trust(log)]
+        row = matched_factor(evidence.speed_ratio(log))
+        if row is not None and row[3] != 1:
+            moving += [Item(name, "not checked", "put the time right first") for name in check_sensors.NAMES]
+        else:
+            moving += check_sensors.items(log, calibrated(log))
     items = (
         _streams(log),
         _rates(log),
@@ -208,14 +175,7 @@ def check(log: Any) -> Check:
         _pauses(log),
         swapped,
         *moving,
-        _trust(log) if swapped.verdict != "bad" else Item("trust", "not checked", "put the position right first"),
-        _standstill(log),
-        *_steps(log),
-        _speed_scale(log),
-        _yaw_bias(log)
-        if moving[3].verdict != "bad"
-        else Item("yaw bias", "not checked", "put the yaw rate right first"),
-        Item("clock offset", "not checked", "the offset between fixes and sensors is not estimated yet"),
+        *_steps(log, steps_of(log)),
     )
     length = float(log.t[-1] - log.t[0]) if len(log) else 0.0
     return Check(log.source, len(log), int(log.fixed.sum()), length, items, log.notes)
@@ -343,7 +303,8 @@ def _trust(log: Log) -> Item:
     if not len(found):
         return Item("trust", "ok", "no fix is frozen or jumps", 0.0)
     said = "; ".join(words.removesuffix(": not used") for words in found.words(log))
-    return Item("trust", "bad" if len(found) > 0.05 * n else "warn", said, float(len(found)))
+    line = check_sensors.fill_line(log)
+    return Item("trust", "bad" if len(found) > 0.05 * n else "warn", said, float(len(found)), line=line)
 
 
 def _speed(log: Log) -> Item:
@@ -353,15 +314,18 @@ def _speed(log: Log) -> Item:
     if not found.enough:
         return Item("speed", "not checked", "the car hardly moves between fixes")
     row = matched_factor(found)
+    shown = {"windows": found.n, "spread": found.spread}
     text = f"speed is {found.value:.3f} times the distance between fixes over time"
     if row is not None:
         name = "speed_mps" if row[3] == 1 else "time"
-        return Item("speed", "bad", f"{text}: {row[1]}", found.value, line=_typed(log, name, _UNIT_AS_TYPED[row[1]]))
+        return Item(
+            "speed", "bad", f"{text}: {row[1]}", found.value, "", _typed(log, name, _UNIT_AS_TYPED[row[1]]), shown
+        )
     if abs(found.value - 1) > 0.1:
-        return Item("speed", "bad", f"{text}, 1 is expected and no known unit explains it", found.value)
+        return Item("speed", "bad", f"{text}, 1 is expected and no known unit explains it", found.value, "", "", shown)
     if abs(found.value - 1) > 0.04:
-        return Item("speed", "warn", f"{text}, 1 is expected", found.value)
-    return Item("speed", "ok", text, found.value)
+        return Item("speed", "warn", f"{text}, 1 is expected", found.value, "", "", shown)
+    return Item("speed", "ok", text, found.value, "", "", shown)
 
 
 def _azimuth(log: Log) -> Item:
@@ -371,6 +335,7 @@ def _azimuth(log: Log) -> Item:
     if not ours.enough:
         return Item("azimuth", "not checked", "the car hardly moves between fixes")
     degrees = float(np.degrees(ours.value))
+    shown = {"windows": ours.n, "spread": float(np.degrees(ours.spread))}
     text = f"azimuth and course between fixes differ by {degrees:.1f} degrees in the middle"
     convention = contradicted_convention(log)
     if convention is not None:
@@ -379,12 +344,12 @@ def _azimuth(log: Log) -> Item:
         if convention.endswith("clockwise from north"):
             sign = "-" if "counter" in convention else ""
             line = _typed(log, "azimuth_rad", "deg" if degrees_given else "rad", sign)
-        return Item("azimuth", "bad", f"{text}: it is in {convention}", degrees, "deg", line)
+        return Item("azimuth", "bad", f"{text}: it is in {convention}", degrees, "deg", line, shown)
     if degrees > 20:
-        return Item("azimuth", "bad", f"{text}, no known convention explains it", degrees, "deg")
+        return Item("azimuth", "bad", f"{text}, no known convention explains it", degrees, "deg", "", shown)
     if degrees > 6:
-        return Item("azimuth", "warn", text, degrees, "deg")
-    return Item("azimuth", "ok", text, degrees, "deg")
+        return Item("azimuth", "warn", text, degrees, "deg", "", shown)
+    return Item("azimuth", "ok", text, degrees, "deg", "", shown)
 
 
 def _yaw(log: Log) -> Item:
@@ -393,6 +358,7 @@ def _yaw(log: Log) -> Item:
     found = evidence.turning(log)
     if not found.enough:
         return Item("yaw rate", "not checked", "the car hardly turns between fixes", None)
+    shown = {"turns": found.n, "correlation": found.correlation}
     text = f"the course changes {found.slope:.3f} times as much as the yaw rate says"
     factor = contradicted_yaw(found)
     if factor is not None:
@@ -400,46 +366,13 @@ def _yaw(log: Log) -> Item:
         wrong = [] if abs(factor) == 1 else [f"it is in {unit}"]
         wrong += ["its sign is that of a turn to the right"] if factor < 0 else []
         line = _typed(log, "yaw_rate_radps", unit, "-" if factor < 0 else "")
-        return Item("yaw rate", "bad", f"{text}: {' and '.join(wrong)}", found.slope, "", line)
+        return Item("yaw rate", "bad", f"{text}: {' and '.join(wrong)}", found.slope, "", line, shown)
     if abs(found.slope - 1) > 0.25:
-        return Item("yaw rate", "warn", f"{text}, 1 is expected", found.slope)
-    return Item("yaw rate", "ok", text, found.slope)
+        return Item("yaw rate", "warn", f"{text}, 1 is expected", found.slope, "", "", shown)
+    return Item("yaw rate", "ok", text, found.slope, "", "", shown)
 
 
-def _standstill(log: Log) -> Item:
-    t, speed = log.stream("speed_mps")
-    if t.size < 2:
-        return Item("standstill", "not checked", "there is no speed")
-    still = (np.abs(speed[:-1]) < _STANDING) & (np.abs(speed[1:]) < _STANDING)
-    share = float(np.diff(t)[still].sum() / (t[-1] - t[0]))
-    return Item("standstill", "ok", f"the car stands {100 * share:.0f} % of the time", share)
-
-
-def quantisation(values: Floats) -> float | None:
-    """Give the step that all values are multiples of, None if they have none.
-
-    Rounding of the step itself is allowed for: 5 km/h written as 1.3889 m/s counts.
-    """
-    distinct = np.unique(values)
-    if distinct.size < 3:
-        return None
-    offset = distinct - distinct[0]
-    step = np.diff(distinct)
-    step = step[step > 1e-9 * max(1.0, float(np.abs(distinct).max()))]
-    if step.size == 0:
-        return None
-    guess = float(np.quantile(step, 0.02, method="lower"))
-    whole = np.round(offset / guess)
-    # a wrong guess of a coarse step adds up: fit it over near multiples first
-    near = (whole > 0) & (whole < 50)
-    if near.any():
-        guess = float(np.median(offset[near] / whole[near]))
-        whole = np.round(offset / guess)
-    off = np.abs(offset / guess - whole)
-    return guess if float((off < 0.12).mean()) > 0.95 else None
-
-
-def _steps(log: Log) -> list[Item]:
+def _steps(log: Log, found: Mapping[str, float]) -> list[Item]:
     """Look at the quantisation of each stream."""
     items = []
     for name in STREAMS:
@@ -447,7 +380,7 @@ def _steps(log: Log) -> list[Item]:
         if name not in _COARSE or values.size < 20:
             continue
         limit, unit, words = _COARSE[name]
-        step = quantisation(values)
+        step = found.get(name)
         title = f"step of {name}"
         if step is None:
             items.append(Item(title, "ok", "no quantisation step found", None, unit))
@@ -465,43 +398,3 @@ def _steps(log: Log) -> list[Item]:
         else:
             items.append(Item(title, "ok", f"values come in steps of {step:.4g} {unit}", step, unit))
     return items
-
-
-def _speed_scale(log: Log) -> Item:
-    """Give the speed's scale only where the windows agree well enough to tell it from noise."""
-    found = evidence.speed_ratio(log)
-    if not found.enough or found.n < 50 or found.spread > 0.03 or abs(found.value - 1) > 0.15:
-        return Item("speed scale", "not checked", "the fixes are too rough, or too few, to tell it")
-    percent = 100 * (found.value - 1)
-    return Item(
-        "speed scale",
-        "warn" if abs(percent) > 5 else "ok",
-        f"roughly {percent:+.1f} %, windows scatter by {100 * found.spread:.1f} %",
-        found.value,
-    )
-
-
-def _yaw_bias(log: Log) -> Item:
-    """Give the yaw rate's mean while the car stands, which is its bias."""
-    name = "yaw bias"
-    t_speed, speed = log.stream("speed_mps")
-    t, rate = log.stream("yaw_rate_radps")
-    if t_speed.size < 2 or t.size < 2:
-        return Item(name, "not checked", "it needs speed and yaw rate")
-    pair = np.searchsorted(t_speed, t).clip(1, t_speed.size - 1)
-    still = (
-        (np.abs(speed[pair]) < _STANDING)
-        & (np.abs(speed[pair - 1]) < _STANDING)
-        & (t_speed[pair] - t_speed[pair - 1] < 2)
-    )
-    held = float(np.diff(t, prepend=t[0])[still].clip(max=1.0).sum())
-    if held < 5 or int(still.sum()) < 10:
-        return Item(name, "not checked", "the car does not stand long enough to tell it")
-    bias = float(np.median(rate[still]))
-    return Item(
-        name,
-        "warn" if abs(bias) > 0.02 else "ok",
-        f"{bias:+.4f} rad/s while the car stands ({held:.0f} s)",
-        bias,
-        "rad/s",
-    )

@@ -10,6 +10,11 @@ tunnel:
     speed  = round(scale * v / step) * step
     gyro   = yaw rate + bias + white,           bias a random walk
     fix    = position + offset + white,         d offset = -offset / time * dt + ..., both axes
+             + multipath * exp(-s / time)       s seconds after the end of a tunnel
+
+Each stream has its own clock. The fixes are those of an antenna, which may sit anywhere on the car;
+the car turns about the middle of its rear axle, whose speed the odometer counts. A second antenna
+gives a second log of fixes, and an azimuth that does not need the car to move.
 
 The road is integrated on the ellipsoid, so that distances and turns agree with the speed and the
 yaw rate to rounding.
@@ -45,7 +50,7 @@ class Truth:
     t : (N,) array
         Time in seconds, the rows of the log.
     lat_deg, lon_deg, alt_m : (N,) arrays
-        Position in degrees and metres.
+        Position of the antenna in degrees and metres.
     azimuth_rad : (N,) array
         Direction of travel in radians, clockwise from north.
     speed_mps : (N,) array
@@ -62,6 +67,13 @@ class Truth:
         Seconds by which the fixes came late.
     speed_scale : float
         What the odometer multiplied the speed by.
+    speed_delay, yaw_delay : float
+        Seconds by which the speed and the yaw rate came late: `clock_offset` less these is what has to be added to
+        their time stamps for them to agree with the fixes.
+    antenna : (float, float)
+        Where the antenna sits, in metres ahead of the middle of the rear axle and to the left of it.
+    second : Log or None
+        What a second antenna recorded: its fixes, at the times of the first one's.
     """
 
     t: Floats
@@ -77,6 +89,10 @@ class Truth:
     outages: tuple[tuple[float, float], ...]
     clock_offset: float
     speed_scale: float
+    speed_delay: float = 0.0
+    yaw_delay: float = 0.0
+    antenna: tuple[float, float] = (0.0, 0.0)
+    second: Log | None = None
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -124,7 +140,14 @@ def simulate_drive(
     yaw_noise: float = 0.004,
     yaw_bias: float = 0.004,
     yaw_drift: float = 1e-4,
+    yaw_step: float = 0.0,
     clock_offset: float = 0.0,
+    speed_delay: float = 0.0,
+    yaw_delay: float = 0.0,
+    multipath: float = 0.0,
+    multipath_time: float = 3.0,
+    antenna: tuple[float, float] = (0.0, 0.0),
+    second: tuple[float, float] | None = None,
     start: tuple[float, float] = (50.0872, 14.4208),
     epoch_s: float | None = None,
 ) -> tuple[Truth, Log]:
@@ -156,8 +179,21 @@ def simulate_drive(
     yaw_noise, yaw_bias, yaw_drift : float
         The gyro's white noise and first bias (standard deviations in radians per second), and the
         increments of the bias in radians per second per root second.
+    yaw_step : float
+        Step of the gyro in radians per second; 0 for none.
     clock_offset : float
         Seconds by which fixes come late: the row at t has the position of t minus this.
+    speed_delay, yaw_delay : float
+        Seconds by which the speed and the yaw rate come late.
+    multipath, multipath_time : float
+        By how many metres the first fix after a tunnel is wrong, in a direction drawn for each tunnel, and the time
+        constant in seconds with which that fades.
+    antenna : (float, float)
+        Where the antenna sits, in metres ahead of the middle of the rear axle and to the left of it.
+    second : (float, float), optional
+        Where a second antenna sits, likewise. The azimuth is then that of the line between the two, also while
+        standing, and `Truth.second` is the log of its fixes: the slow error is the same for both antennas, the white
+        one is not.
     start : (float, float)
         Latitude and longitude of the start in degrees.
     epoch_s : float, optional
@@ -194,32 +230,39 @@ def simulate_drive(
         ("yaw_noise", yaw_noise),
         ("yaw_bias", yaw_bias),
         ("yaw_drift", yaw_drift),
+        ("yaw_step", yaw_step),
+        ("multipath", multipath),
     ):
         if not 0 <= value < np.inf:
             raise BadValue(f"`{name}` is {value}, 0 or more is expected")
-    rng = np.random.default_rng(seed)
-    lead = abs(clock_offset) + 1.0
-    fine, speed, azimuth, lat, lon = _motion(rng, duration + 2 * lead, start)
+    for name, value in (("clock_offset", clock_offset), ("speed_delay", speed_delay), ("yaw_delay", yaw_delay)):
+        if not abs(value) <= 60:
+            raise BadValue(f"`{name}` is {value} s, at most a minute either way is expected")
+    if not multipath_time > 0:
+        raise BadValue(f"`multipath_time` is {multipath_time} s, a positive number is expected")
+    if second is not None and np.hypot(second[0] - antenna[0], second[1] - antenna[1]) < 0.1:
+        raise BadValue(f"`second` is {second}, at least 0.1 m from `antenna` at {antenna} is expected")
+    rng, more = np.random.default_rng(seed), np.random.default_rng([seed, 2])
+    lead = max(abs(clock_offset), abs(speed_delay), abs(yaw_delay)) + 1.0
+    fine, speed, azimuth, axle_lat, axle_lon = _motion(rng, duration + 2 * lead, start)
     fine = fine - lead
+    lat, lon = _moved(axle_lat, axle_lon, *_ahead(azimuth, antenna))
 
     t = np.arange(int(np.floor(duration * rate + 1e-9)) + 1) / rate
     v = np.interp(t, fine, speed)
-    yaw_rate = -np.interp(t, fine, np.gradient(azimuth, _DT))
+    turning = -np.gradient(azimuth, _DT)
+    yaw_rate = np.interp(t, fine, turning)
     bias = yaw_bias * rng.standard_normal() + np.cumsum(yaw_drift * rng.standard_normal(t.size) / np.sqrt(rate))
-    measured = speed_scale * v
-    if speed_step > 0:
-        measured = np.round(measured / speed_step) * speed_step
+    measured = _stepped(speed_scale * np.interp(t - speed_delay, fine, speed), speed_step)
     slow = _gauss_markov(rng, t.size, 1 / rate, fix_offset, fix_offset_time)
 
     then = t - clock_offset
-    fix_lat, fix_lon = np.interp(then, fine, lat), np.interp(then, fine, lon)
-    meridian, normal = radii_m(np.radians(fix_lat))
-    wrong = slow + fix_noise * rng.standard_normal((2, t.size))
-    fix_lon = fix_lon + np.degrees(wrong[0] / (normal * np.cos(np.radians(fix_lat))))
-    fix_lat = fix_lat + np.degrees(wrong[1] / meridian)
+    white = fix_noise * rng.standard_normal((2, t.size))
     alt = 220 + 12 * np.sin(2 * np.pi * t / 400) + 3 * np.sin(2 * np.pi * t / 90)
     course = np.interp(then, fine, azimuth)
     v_fix = np.interp(then, fine, speed)
+    w_fix = np.interp(then, fine, turning)
+    course = course - np.arctan2(w_fix * antenna[0], v_fix - w_fix * antenna[1])  # the way the antenna goes
     course = course + 0.15 / np.maximum(v_fix, 1.0) * rng.standard_normal(t.size)
     height = alt + 1.5 * rng.standard_normal(t.size)
 
@@ -236,18 +279,31 @@ def simulate_drive(
         if not first <= last:
             raise BadValue(f"`outages` holds ({first}, {last}), first <= last is expected")
         seen &= ~((t >= first) & (t <= last))
+    shared = slow + _multipath(more, t, outages, multipath, multipath_time)
+    gyro = np.interp(t - yaw_delay, fine, turning) + bias + yaw_noise * rng.standard_normal(t.size)
 
     def fixed(values: Floats) -> Floats:
         return np.where(seen, values, np.nan)
 
+    fix_lat, fix_lon = _moved(np.interp(then, fine, lat), np.interp(then, fine, lon), *(shared + white))
+    other: Log | None = None
+    if second is None:
+        course = np.where(v_fix > 1, course, np.nan)
+    else:
+        beside = np.array(_ahead(np.interp(then, fine, azimuth), second))
+        white2 = fix_noise * more.standard_normal((2, t.size))
+        at2 = _moved(np.interp(then, fine, axle_lat), np.interp(then, fine, axle_lon), *(beside + shared + white2))
+        other = Log(t=t, lat_deg=fixed(at2[0]), lon_deg=fixed(at2[1]), source=f"second antenna, seed {seed}")
+        line = beside - np.array(_ahead(np.interp(then, fine, azimuth), antenna)) + white2 - white
+        course = np.arctan2(*line) + np.arctan2(second[1] - antenna[1], second[0] - antenna[0])
     log = Log(
         t=t,
         lat_deg=fixed(fix_lat),
         lon_deg=fixed(fix_lon),
         alt_m=fixed(height),
-        azimuth_rad=np.where(v_fix > 1, fixed(np.mod(course, 2 * np.pi)), np.nan),
+        azimuth_rad=fixed(np.mod(course, 2 * np.pi)),
         speed_mps=measured,
-        yaw_rate_radps=yaw_rate + bias + yaw_noise * rng.standard_normal(t.size),
+        yaw_rate_radps=_stepped(gyro, yaw_step),
         ax_mps2=forward,
         ay_mps2=left,
         source=f"simulated drive, seed {seed}",
@@ -267,8 +323,43 @@ def simulate_drive(
         outages=tuple((float(first), float(last)) for first, last in outages),
         clock_offset=float(clock_offset),
         speed_scale=float(speed_scale),
+        speed_delay=float(speed_delay),
+        yaw_delay=float(yaw_delay),
+        antenna=(float(antenna[0]), float(antenna[1])),
+        second=other,
     )
     return truth, log
+
+
+def _stepped(values: Floats, step: float) -> Floats:
+    """Round to whole steps; 0 for none."""
+    return np.round(values / step) * step if step > 0 else values
+
+
+def _ahead(azimuth: Floats, place: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Return how far east and north of the axle a place (ahead, to the left) on the car is, in metres."""
+    ahead, left = place
+    sin, cos = np.sin(azimuth), np.cos(azimuth)
+    return ahead * sin - left * cos, ahead * cos + left * sin
+
+
+def _moved(lat_deg: Floats, lon_deg: Floats, east: Floats, north: Floats) -> tuple[Floats, Floats]:
+    """Move positions in degrees by some metres east and north."""
+    meridian, normal = radii_m(np.radians(lat_deg))
+    lon = lon_deg + np.degrees(east / (normal * np.cos(np.radians(lat_deg))))
+    return lat_deg + np.degrees(north / meridian), lon
+
+
+def _multipath(
+    rng: np.random.Generator, t: Floats, outages: Sequence[tuple[float, float]], size: float, time: float
+) -> Floats:
+    """Return the error (2, N) that fades after each outage, in metres."""
+    wrong = np.zeros((2, t.size))
+    for _, last in outages:
+        toward = rng.uniform(0, 2 * np.pi)
+        since = np.where(t > last, t - last, np.inf)
+        wrong += size * np.array([[np.sin(toward)], [np.cos(toward)]]) * np.exp(-since / time)
+    return wrong
 
 
 def _motion(

@@ -9,6 +9,11 @@ cv            constant velocity, Rauch-Tung-Striebel smoother
 gpsins        the linear GPS/INS model of Pavelková (2011) with that smoother, acceleration from speed and azimuth
 ctrv          constant turn rate and velocity, extended Kalman smoother, with speed scale and yaw bias
 em            the chain of `halfwidth.vehicle.chain`, the default of `fill`
+em-slow       the same, the fix error a Gaussian offset without drift and jumps
+em-white      the same, the fix error white noise
+slp           the same with bounded noise by sequential linear programming, central point (`bounded`)
+slp-white     the same, the fix error without an offset
+slp-log       that with the logarithmic objective
 paper000      GPS/INS by linear programming, half-widths unknown, as printed in Pavelková (2011)
 paper000+ls   the same, least squares inside the optimal half-widths
 paper002      the linearised two-antenna model with one antenna, middle azimuth, least squares likewise
@@ -31,10 +36,11 @@ from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Normal
-from halfwidth.vehicle import chain, models
+from halfwidth.vehicle import bounded, chain, models
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
+from halfwidth.vehicle.pointing import azimuth_of
 
 Floats = NDArray[np.float64]
 Tuned = Mapping[str, float]
@@ -157,7 +163,7 @@ def _pace(drive: Grid) -> float:
 
 def _acceleration(drive: Grid) -> Floats:
     """Return the acceleration (T, 2) over each step, in local axes, from speed and azimuth."""
-    azimuth, v, h = chain.azimuth_of(drive), drive.speed, drive.h
+    azimuth, v, h = azimuth_of(drive), drive.speed, drive.h
     at_node = 0.5 * (v + np.concatenate((v[1:], v[-1:])))
     velocity = at_node[:, None] * np.column_stack((np.sin(azimuth), np.cos(azimuth)))
     pushed: Floats = np.diff(velocity, axis=0, prepend=velocity[:1]) / h[:, None]
@@ -292,7 +298,7 @@ def _turning(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
     paths = []
     for drive in drives:
         case = _ctrv_case(drive)
-        model = _ctrv(drive, case, {**tuned, "azimuth": float(chain.azimuth_of(drive)[0])})
+        model = _ctrv(drive, case, {**tuned, "azimuth": float(azimuth_of(drive)[0])})
         est = estimate(model, case.record, load("ExtendedKalman")(smooth=True))
         paths.append(_path(drive, case, est, est.x[:, 2], est.x[:, 3], tuned))
     return paths
@@ -300,7 +306,7 @@ def _turning(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
 
 def _tuned_ctrv(drive: Grid) -> Tuned:
     names, case = list(_CTRV_START), _ctrv_case(drive)
-    azimuth = float(chain.azimuth_of(drive)[0])
+    azimuth = float(azimuth_of(drive)[0])
 
     def loglik(log_scales: Floats) -> float:
         scales = dict(zip(names, (float(v) for v in np.exp(log_scales)), strict=True))
@@ -323,7 +329,7 @@ def _programme(build: Callable[[Grid], tuple[Linear, Floats]], **settings: Any) 
             model, u = build(drive)
             case = _case(drive, u)
             est = estimate(model, case.record, load("BatchLP")(**settings))
-            paths.append(_path(drive, case, est, chain.azimuth_of(drive), drive.speed, tuned))
+            paths.append(_path(drive, case, est, azimuth_of(drive), drive.speed, tuned))
         return paths
 
     return run
@@ -334,16 +340,29 @@ def _ins(drive: Grid) -> tuple[Linear, Floats]:
 
 
 def _two_antenna(drive: Grid) -> tuple[Linear, Floats]:
-    moved = models.displacement(chain.azimuth_of(drive), drive.speed, drive.h)
+    moved = models.displacement(azimuth_of(drive), drive.speed, drive.h)
     return models.two_antenna_linear(antennas=1), moved
 
 
 # ---- the chain -----------------------------------------------------------------------------------------------------
 
 
-def _chain(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:  # noqa: ARG001
-    return [fit.path for fit in chain.solve(drives)]
+def _chain(settings: chain.Chain) -> Callable[[Sequence[Grid], Tuned], list[Path]]:
+    return lambda drives, tuned: [fit.path for fit in chain.solve(drives, settings)]  # noqa: ARG005
 
+
+def _bounded(settings: bounded.Bounded) -> Callable[[Sequence[Grid], Tuned], list[Path]]:
+    return lambda drives, tuned: bounded.solve(drives, settings)  # noqa: ARG005
+
+
+#: What the chain may take the error of a fix for; the first is the usual one.
+COLOURS: Mapping[str, chain.Chain] = MappingProxyType(
+    {
+        "em": chain.Chain(),
+        "em-slow": chain.Chain(tail=np.inf, drifting=False),
+        "em-white": chain.Chain(slow=False),
+    }
+)
 
 _SENSORS = ("speed", "yaw_rate")
 
@@ -356,7 +375,20 @@ METHODS: Mapping[str, Method] = MappingProxyType(
             Method("cv", "constant velocity, RTS smoother", 20.0, (), _smoothed(False), _tuned(False)),
             Method("gpsins", "linear GPS/INS, RTS smoother", 20.0, _SENSORS, _smoothed(True), _tuned(True)),
             Method("ctrv", "constant turn rate and velocity, EKF + RTS", 20.0, _SENSORS, _turning, _tuned_ctrv),
-            Method("em", "chain that learns its own noise", 60.0, (), _chain, one_of=_SENSORS),
+            *(
+                Method(
+                    name, f"chain that learns its own noise{words}", 60.0, (), _chain(COLOURS[name]), one_of=_SENSORS
+                )
+                for name, words in (("em", ""), ("em-slow", ", slow fix error"), ("em-white", ", white fix error"))
+            ),
+            *(
+                Method(name, f"chain with bounded noise{words}", 20.0, (), _bounded(settings), one_of=_SENSORS)
+                for name, words, settings in (
+                    ("slp", "", bounded.Bounded()),
+                    ("slp-white", ", no fix offset", bounded.Bounded(slow=False)),
+                    ("slp-log", ", log objective", bounded.Bounded(objective="log", slow=False)),
+                )
+            ),
             Method(
                 "paper000",
                 "GPS/INS by linear programming, as printed",

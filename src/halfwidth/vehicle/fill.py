@@ -1,16 +1,18 @@
 """Fill a drive: a position with a half-width for every row of a log that had, or could have had, a fix.
 
 The log is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
-gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened by what
-hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate too are tested by
-hiding these as well, and bridged by constant velocity where hidden fixes show that to be better. A method that fails on
-a piece is replaced by a simpler one there, and the track says so.
+gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened or
+narrowed by what hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate
+too are tested by hiding these as well, and bridged by constant velocity where hidden fixes show that to be better;
+where they speak, the chain whose fixes are wrong by white noise only competes in the same way. A method that fails on a
+piece is replaced by a simpler one there, and the track says so.
 
-Positions are those that the receiver would have reported. What it is wrong by for minutes at a time is in the fixes on
-both sides of a gap and in the filling between them, and hiding fixes cannot show it. The chain learns how large that
-slow error is (its fix offset), and the half-widths have it added:
+Positions are those that the receiver would have reported, and the half-widths say how far off they are: hidden fixes
+lie within them as often as `level` says, on this log. What the receiver is wrong by for minutes at a time is in the
+fixes on both sides of a gap and in the filling between them, and hiding fixes cannot show it; the chain learns how
+large that slow error is (its fix offset), and the messages name it.
 
-    half = z sqrt(inflation^2 (variance of the path + variance of a fix) + variance of the slow error)
+    half = z inflation sqrt(variance of the path + variance of a fix)
 """
 
 import os
@@ -24,13 +26,15 @@ from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle import calibrate, chain
+from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.distrust import distrusted
-from halfwidth.vehicle.estimators import METHODS, Method, heading_of, usable
+from halfwidth.vehicle.estimators import COLOURS, METHODS, Method, heading_of, usable
 from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log
-from halfwidth.vehicle.path import Path
+from halfwidth.vehicle.path import Path, sized
+from halfwidth.vehicle.stray import strays
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
 
 Floats = NDArray[np.float64]
@@ -49,6 +53,9 @@ FEWEST = 5
 
 #: Times that fixes are screened for strays at most.
 _SCREENINGS = 3
+
+#: The chain that screens fixes: one whose fixes neither drift nor jump, so that it does not follow strays.
+_STIFF = chain.Chain(rounds=8, tail=np.inf, drifting=False)
 
 #: Rounds in which the chain is solved again with hidden fixes, its scales kept: from the azimuths found with all fixes
 #: or, where a gap has no yaw rate or speed to find them by, from what is known without the hidden ones.
@@ -79,8 +86,8 @@ def fill(
     level : float
         Probability of the half-widths, between 0 and 1.
     clock_offset : float, optional
-        Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; 0 if
-        absent.
+        Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; found from
+        the log, for each by itself, if absent.
     distrust : bool
         Whether fixes that only repeat the one before while the car moves are found and bridged; the track's messages
         name them.
@@ -110,12 +117,16 @@ def fill(
         messages.extend(doubtful.words(drive_log))
         drive_log = doubtful.masked(drive_log)
     drive_log = _with_pauses_filled(drive_log, messages)
-    grid = sampled(drive_log, clock_offset=offset)
+    sensors = calibrated(drive_log, clock_offset=None if clock_offset is None else offset)
+    messages.extend(sensors.words())
+    grid = sampled(drive_log, sensors=sensors)
     chosen = _chosen(grid, asked, messages)
-    if clock_offset is None and chosen.name not in ("linear", "cv"):
-        messages.append("the clocks of fixes and sensors were taken to agree")
     wanted, quality = _wanted(drive_log)
     t = drive_log.t[wanted]
+    if distrust:
+        stray = strays(grid, sensors)
+        messages.extend(filter(None, [stray.words(grid)]))
+        grid = stray.masked(grid)
     pieces = _pieces(grid, drive_log)
     spans = _spans(drive_log, grid, chosen, t, quality)
     free = asked is None or asked.name != chosen.name
@@ -124,9 +135,10 @@ def fill(
     away = _distance_in_time(drive_log, t)
     z = NormalDist().inv_cdf(0.5 + level / 2)
     half = _half_widths(columns, answers, grid, away, z, t, quality)
-    lat, lon = grid.frame.to_geodetic(columns.east, columns.north)
+    arm_east, arm_north = sensors.arm(t)
+    lat, lon = grid.frame.to_geodetic(columns.east + arm_east, columns.north + arm_north)
     gaps = gaps_of(t, lat, lon, half.max(axis=1), quality)
-    settings: dict[str, object] = {"clock_offset": offset, "context": CONTEXT}
+    settings: dict[str, object] = {"context": CONTEXT, "sensors": sensors.to_dict()}
     settings.update(answers.settings)
     return Track(
         t_s=t,
@@ -365,6 +377,14 @@ class _Bridge:
 
 
 @dataclass(frozen=True, eq=False)
+class _Rival:
+    """Another way to fill: its paths by piece, and how to run it again."""
+
+    paths: Mapping[int, Path]
+    rerun: Rerun
+
+
+@dataclass(frozen=True, eq=False)
 class _Answers:
     """Paths of the pieces, what hiding fixes showed, and what was found on the way."""
 
@@ -390,37 +410,45 @@ def _estimated(
     """Estimate every piece, with simpler methods where the chosen one fails, and test the intervals."""
     grids = [piece.grid for piece in pieces]  # of which the chain takes away the fixes it cannot believe
     able = [i for i, grid in enumerate(grids) if chosen.name == "linear" or int(grid.seen.sum()) >= FEWEST]
-    found, rerun, settings = _chain(grids, able, messages) if chosen.name == "em" else _plain(chosen, grids, able)
+    found, rerun, settings = _ran(chosen, grids, able, messages)
     failed = [i for i in range(len(grids)) if i not in found or not _plausible(found[i], grids[i])]
     if failed and chosen.name != "linear":
         messages.append(_failed_words(chosen, [pieces[i] for i in failed], len(pieces)))
     paths = [_spare(grid, chosen) if i in failed else found[i] for i, grid in enumerate(grids)]
     good = [i for i in range(len(grids)) if i not in failed]
     sensed = all(grid.has_speed and grid.has_yaw_rate for grid in grids)
-    # where sensors are lacking the chain guesses what they would have said, and constant velocity may do better
-    simple = METHODS["cv"]
-    rivals: dict[int, Path] = {}
-    if free and chosen.name == "em" and good and any(span.silent or not sensed for span in spans):
-        rivals, rerun_simple, _ = _plain(simple, grids, good)
-        rivals = {i: path for i, path in rivals.items() if _plausible(path, grids[i])}
-    # a variance that rests on a guess may be made smaller by the test, one that a model claims may not
-    claimed = all(path.info.get("claimed", True) for path in paths) and all(grid.has_speed for grid in grids)
+    # where sensors are lacking the chain guesses what they would have said, and constant velocity may do better;
+    # where they speak, fixes may be wrong by white noise and nothing else
+    rivals: dict[str, _Rival] = {}
+    if free and chosen.name == "em" and good:
+        blind = any(span.silent or not sensed for span in spans)
+        names = [
+            *(["em-white"] if any(not span.silent for span in spans) and sensed else []),
+            *(["cv"] if blind else []),
+        ]
+        for name in names:
+            own, again, _ = _ran(METHODS[name], grids, good, None)
+            if all(_plausible(path, grids[i]) for i, path in own.items()):
+                rivals[name] = _Rival(own, again)
     bridges: list[_Bridge] = []
     for silent in sorted({span.silent for span in spans}):
         alike = [span for span in spans if span.silent == silent]
         guessed = bool(silent) or not sensed
-        rival = guessed and len(rivals) == len(good) > 0
+        against = {name: one for name, one in rivals.items() if (name == "cv") == guessed}
 
         def filled(
-            which: Sequence[int], hidden: Sequence[Grid], guessed: bool = guessed, rival: bool = rival
+            which: Sequence[int],
+            hidden: Sequence[Grid],
+            guessed: bool = guessed,
+            against: Mapping[str, _Rival] = against,
         ) -> dict[str, list[Path]]:
             own = [good[k] for k in which]
             first = rerun(own, hidden, guessed)
-            if not rival:
-                return {chosen.name: first}
-            second = rerun_simple(own, hidden, guessed)
-            both = zip(first, second, hidden, strict=True)
-            return {chosen.name: first, simple.name: [_bridged(a, b, grid, _pauses(grid)) for a, b, grid in both]}
+            ways = {chosen.name: first}
+            for name, rival in against.items():
+                both = zip(first, rival.rerun(own, hidden, guessed), hidden, strict=True)
+                ways[name] = [_bridged(a, b, grid, _pauses(grid)) for a, b, grid in both]
+            return ways
 
         tests: dict[str, list[calibrate.Tested]] = {}
         if good:
@@ -428,24 +456,30 @@ def _estimated(
             lengths = calibrate.lengths_to_test(whole, np.array([span.length for span in alike]))
             z = NormalDist().inv_cdf(0.5 + level / 2)
             tests = calibrate.tested(whole, filled, lengths, level, z, silent, guessed=guessed)
-        least = 1.0 if claimed and not silent else 0.0
-        # beyond the ends there is no gap with two sides to hide, so nothing shows that less would do
         fixes = [grid.t[grid.seen] for grid in grids if grid.seen.any()]
         first_fix, last_fix = min(t[0] for t in fixes), max(t[-1] for t in fixes)
+        inner = [s for s in alike if s.start >= first_fix - 1e-6 and s.stop <= last_fix + 1e-6]
+        outer = [span for span in alike if span not in inner]
+        ends = _end_tests(chosen.name, [grids[i] for i in good], good, rerun, outer, level)
         mine = []
-        for span in alike:
-            inside = span.start >= first_fix - 1e-6 and span.stop <= last_fix + 1e-6
-            by = _nearer(tests, chosen.name, simple.name, span.length) if inside else chosen.name
-            mine.append(_Bridge(span, by, tuple(tests.get(by, ())), least if inside else max(least, 1.0)))
+        for span in inner:
+            by = _nearest(tests, chosen.name, span.length)
+            mine.append(_Bridge(span, by, tuple(tests.get(by, [])), 0.0))
+        for span in outer:
+            # without a test of its own, an end is at least as uncertain as a model says
+            own_test = ends or tests.get(chosen.name, [])
+            mine.append(_Bridge(span, chosen.name, tuple(own_test), 0.0 if ends else 1.0))
         bridges += mine
+        messages.extend(_choice_words(tests, mine))
         messages.extend(_test_words(mine, level, chosen.name))
-    for i, path in rivals.items():
-        taken = [(b.span.start, b.span.stop) for b in bridges if b.by == simple.name != chosen.name]
-        paths[i] = _bridged(paths[i], path, grids[i], taken)
+    for name, rival in rivals.items():
+        taken = [(bridge.span.start, bridge.span.stop) for bridge in bridges if bridge.by == name]
+        for i, path in rival.paths.items():
+            paths[i] = _bridged(paths[i], path, grids[i], taken)
     answers = _Answers(paths, bridges, settings)
     settings.update(
         {
-            f"inflation at {one.length_s:.3g} s{_without(one.silent)}{_by(one.by, chosen.name)}": round(
+            f"inflation at {one.length_s:.3g} s{_beyond(one)}{_without(one.silent)}{_by(one.by, chosen.name)}": round(
                 one.inflation, 3
             )
             for one in answers.tested
@@ -454,16 +488,38 @@ def _estimated(
     return answers
 
 
-def _nearer(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, simple: str, length: float) -> str:
-    """Return which of two ways came nearer to hidden fixes, and was surer, in stretches about as long as this."""
-    if usual not in tests or simple not in tests:
-        return simple if simple in tests else usual
+def _end_tests(
+    name: str, grids: Sequence[Grid], good: Sequence[int], rerun: Rerun, spans: Sequence[_Span], level: float
+) -> list[calibrate.Tested]:
+    """Test half-widths beyond the first and the last fix of a log."""
+    if not spans or not good:
+        return []
+    lengths = calibrate.lengths_to_test(grids, np.array([span.length for span in spans]))
+    z = NormalDist().inv_cdf(0.5 + level / 2)
+    return calibrate.tested_ends(
+        grids,
+        lambda which, hidden: rerun([good[k] for k in which], hidden, True),
+        lengths,
+        level,
+        z,
+        spans[0].silent,
+        by=name,
+    )
+
+
+def _nearest(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, length: float) -> str:
+    """Return which way came nearest to hidden fixes, and was surest, in stretches about as long as this.
+
+    Another way than the usual one has to be clearly better.
+    """
+    if not tests:
+        return usual
 
     def loss(name: str) -> float:
         one = min(tests[name], key=lambda one: abs(np.log(one.length_s / max(length, 1e-3))))
-        return one.mean_m * one.half_m
+        return one.mean_m * one.half_m / (1.0 if name == usual else _BETTER)
 
-    return simple if loss(simple) < _BETTER * loss(usual) else usual
+    return min(tests, key=loss)
 
 
 def _pauses(grid: Grid) -> list[tuple[float, float]]:
@@ -500,20 +556,29 @@ def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, f
     return replace(path, **columns, variance=variance)
 
 
-def _chain(
-    grids: list[Grid], able: Sequence[int], messages: list[str]
+def _ran(
+    chosen: Method, grids: list[Grid], able: Sequence[int], messages: list[str] | None
 ) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
-    """Solve the chain for the pieces that have enough fixes."""
-    fits = dict(zip(able, chain.solve([grids[i] for i in able]), strict=True))
+    """Run a method on the pieces that have enough fixes."""
+    return _chain(chosen, grids, able, messages) if chosen.name in COLOURS else _plain(chosen, grids, able)
+
+
+def _chain(
+    chosen: Method, grids: list[Grid], able: Sequence[int], messages: list[str] | None
+) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
+    """Solve the chain without the fixes that it cannot believe; where `messages` is None they are gone already."""
+    colour = COLOURS[chosen.name]
     stray: list[float] = []
-    todo = list(able)
+    todo = list(able) if messages is not None else []
+    messages = [] if messages is None else messages
     for _ in range(_SCREENINGS):
-        hidden = {i: _stray(fits[i].path, grids[i]) for i in todo}
+        screened = zip(todo, chain.solve([grids[i] for i in todo], _STIFF), strict=True)
+        hidden = {i: _stray(fit.path, grids[i]) for i, fit in screened}
         todo = [i for i in todo if hidden[i].any()]
         for i in todo:
             stray += grids[i].t[hidden[i]].tolist()
             grids[i] = grids[i].masked(hidden[i])
-        fits |= zip(todo, chain.solve([grids[i] for i in todo]), strict=True)
+    fits = dict(zip(able, chain.solve([grids[i] for i in able], colour), strict=True))
     if stray:
         times = sorted(set(stray))
         words = ", ".join(f"{t:.1f}" for t in times[:5]) + (" ..." if len(times) > 5 else "")
@@ -525,9 +590,10 @@ def _chain(
             fit.path
             for fit in chain.solve(
                 hidden,
-                chain.Chain(rounds=_AFRESH if afresh else _AGAIN),
+                replace(colour, rounds=_AFRESH if afresh else _AGAIN),
                 sigma=np.array([fits[i].sigma for i in which]),
                 azimuth=None if afresh else [fits[i].z[:, chain.AZIMUTH] for i in which],
+                weight=None if afresh else [fits[i].weight for i in which],
                 learn=False,
             )
         ]
@@ -543,9 +609,10 @@ def _chain(
             value = np.average([fit.path.info[name] for fit in fits.values()], weights=weight)
             settings[_WORDS[name]] = float(f"{value:.4g}")
         slow = float(np.average([fit.path.info["slow_sd"] for fit in fits.values()], weights=weight))
+    if fits and colour.slow:
         messages.append(
             f"the fixes are taken to be wrong by {slow:.2g} m for minutes at a time (1 sigma, learnt from the drive);"
-            " the half-widths have it added"
+            " hiding fixes cannot show that, and the half-widths say where the receiver would have seen the vehicle"
         )
     return {i: fit.path for i, fit in fits.items()}, rerun, settings
 
@@ -568,7 +635,7 @@ def _plain(
     tuned = chosen.tune(grids[max(able, key=lambda i: len(grids[i]))]) if able else {}
 
     def rerun(which: Sequence[int], hidden: Sequence[Grid], afresh: bool) -> list[Path]:  # noqa: ARG001
-        return [_with_variance(p, g) for p, g in zip(chosen.run(hidden, tuned), hidden, strict=True)]
+        return [sized(p, g) for p, g in zip(chosen.run(hidden, tuned), hidden, strict=True)]
 
     settings: dict[str, object] = {f"{_words(name)} noise": float(f"{value:.3g}") for name, value in tuned.items()}
     return dict(zip(able, rerun(able, [grids[i] for i in able], True), strict=True)), rerun, settings
@@ -620,27 +687,6 @@ def _top_speed(grid: Grid) -> float:
     return max(1.5 * fastest, 10.0)
 
 
-def _with_variance(path: Path, grid: Grid) -> Path:
-    """Give a path without a variance the shape of one: it grows with the time to the nearest fix.
-
-    The shape means nothing by itself; hiding fixes gives it its size.
-    """
-    if path.variance is not None:
-        return path
-    fixes = grid.t[grid.seen]
-    k = np.clip(np.searchsorted(fixes, grid.t), 1, max(fixes.size - 1, 1))
-    near = np.minimum(np.abs(grid.t - fixes[k - 1]), np.abs(grid.t - fixes[np.minimum(k, fixes.size - 1)]))
-    sd = 0.3 + 0.5 * near
-    seen = grid.seen
-    off = np.concatenate(((path.east - grid.east)[seen], (path.north - grid.north)[seen]))
-    return replace(
-        path,
-        variance=np.column_stack((sd**2, sd**2)),
-        fix_variance=float(np.mean(off**2)),
-        info={**path.info, "claimed": False},
-    )
-
-
 def _failed_words(chosen: Method, pieces: Sequence[_Piece], n: int) -> str:
     spans = ", ".join(f"{piece.start:.0f} to {piece.stop:.0f} s" for piece in pieces[:3])
     more = f" and {len(pieces) - 3} more" if len(pieces) > 3 else ""
@@ -650,13 +696,28 @@ def _failed_words(chosen: Method, pieces: Sequence[_Piece], n: int) -> str:
     )
 
 
+def _choice_words(tests: Mapping[str, Sequence[calibrate.Tested]], bridges: Sequence[_Bridge]) -> list[str]:
+    """Say how near each way came to hidden fixes, where there was a choice, and which was taken."""
+    if len(tests) < 2:
+        return []
+    found = "; ".join(
+        f"{row[0].length_s:.3g} s " + ", ".join(f"{one.by} {one.mean_m:.2f} m" for one in row)
+        for row in zip(*tests.values(), strict=False)
+    )
+    taken = " and ".join(dict.fromkeys(bridge.by for bridge in bridges))
+    return [f"chosen by hiding fixes{_without(bridges[0].span.silent)}: {taken}; mean errors {found}"]
+
+
 def _test_words(bridges: Sequence[_Bridge], level: float, usual: str) -> list[str]:
     """Say what hiding fixes showed about gaps of one kind."""
     found = []
     without = _without(bridges[0].span.silent)
-    for by in dict.fromkeys(bridge.by for bridge in bridges):
-        mine = [bridge for bridge in bridges if bridge.by == by]
-        tested, least = mine[0].tested, min(bridge.least for bridge in mine)
+    groups: dict[object, list[_Bridge]] = {}
+    for bridge in bridges:
+        groups.setdefault((bridge.by, bridge.tested), []).append(bridge)
+    for mine in groups.values():
+        by, tested, least = mine[0].by, mine[0].tested, min(bridge.least for bridge in mine)
+        beyond = _beyond(tested[0]) if tested else ""
         if not tested:
             found.append(
                 f"too few fixes to test the half-widths{without} on this log: they are the model's own,"
@@ -667,10 +728,9 @@ def _test_words(bridges: Sequence[_Bridge], level: float, usual: str) -> list[st
             f"{one.length_s:.3g} s: {100 * one.coverage:.0f} % of hidden fixes inside, {_change(one.inflation, least)}"
             for one in tested
         )
-        found.append(
-            f"{100 * level:g} % intervals{without}{_by(by, usual)} tested on {sum(o.stretches for o in tested)} hidden"
-            f" stretches: {words}"
-        )
+        which = f"{beyond}{without}{_by(by, usual)}"
+        stretches = sum(one.stretches for one in tested)
+        found.append(f"{100 * level:g} % intervals{which} tested on {stretches} hidden stretches: {words}")
         longest, most = tested[-1].length_s, max(bridge.span.length for bridge in mine)
         if most > 1.2 * longest:
             found.append(
@@ -683,6 +743,10 @@ def _test_words(bridges: Sequence[_Bridge], level: float, usual: str) -> list[st
 def _change(inflation: float, least: float) -> str:
     factor = max(inflation, least, calibrate.LEAST)
     return f"widened {factor:.2f} times" if factor >= 1 else f"narrowed to {factor:.2f} times"
+
+
+def _beyond(one: calibrate.Tested) -> str:
+    return " beyond the fixes" if one.side == "one" else ""
 
 
 def _without(silent: Sequence[str]) -> str:
@@ -706,13 +770,12 @@ class _Columns:
     speed: Floats
     variance: Floats  # (M, 2)
     fix_variance: Floats  # (M,)
-    slow_variance: Floats  # (M,)
 
 
 def _read(answers: _Answers, pieces: Sequence[_Piece], t: Floats) -> _Columns:
     """Read each row off the path of its piece."""
     east, north, azimuth, speed_at = (np.full(t.size, np.nan) for _ in range(4))
-    columns = _Columns(east, north, azimuth, speed_at, np.zeros((t.size, 2)), np.zeros(t.size), np.zeros(t.size))
+    columns = _Columns(east, north, azimuth, speed_at, np.zeros((t.size, 2)), np.zeros(t.size))
     starts = np.array([piece.start for piece in pieces])
     of = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(pieces) - 1)
     for i, path in enumerate(answers.paths):
@@ -732,7 +795,6 @@ def _read(answers: _Answers, pieces: Sequence[_Piece], t: Floats) -> _Columns:
         for j in (0, 1):
             columns.variance[rows, j] = np.interp(at, path.t, variance[:, j])
         columns.fix_variance[rows] = path.fix_variance
-        columns.slow_variance[rows] = path.info.get("slow_sd", 0.0) ** 2
     return columns
 
 
@@ -766,10 +828,9 @@ def _half_widths(
     for bridge in answers.bridges:
         rows = (quality != "fix") & (t >= bridge.span.start) & (t <= bridge.span.stop)
         factor[rows] = calibrate.inflation(bridge.tested, np.array([bridge.span.length]), least=bridge.least)
-    quick = factor[:, None] ** 2 * (columns.variance + columns.fix_variance[:, None])
-    half = z * np.sqrt(quick + columns.slow_variance[:, None])
+    half = z * factor[:, None] * np.sqrt(columns.variance + columns.fix_variance[:, None])
     # twice: both the estimate and the vehicle are within reach of the nearest fix
-    limit = 2 * _top_speed(grid) * away + z * np.sqrt(columns.fix_variance + columns.slow_variance) + 10.0
+    limit = 2 * _top_speed(grid) * away + z * np.sqrt(columns.fix_variance) + 10.0
     return np.minimum(half, limit[:, None])
 
 

@@ -2,9 +2,9 @@
 
 Every estimator of this package works on the same `Grid`. Its nodes are the fixes, thinned to at least 0.19 s apart
 (5 Hz), and, where fixes are further apart than the sensors allow, nodes in between. Speed and yaw rate are averaged
-over each step (their integral by the trapezoid rule, divided by the step), after the sensor clock has been moved by
-`clock_offset`. Where a sensor was silent its mean is an interpolation; `speed_sd` and `yaw_rate_sd` say how wrong
-that may be.
+over each step (their integral by the trapezoid rule, divided by the step), after they have been put right by what is
+known of the sensors (`Calibration`). Where a sensor was silent its mean is an interpolation; `speed_sd` and
+`yaw_rate_sd` say how wrong that may be.
 """
 
 from bisect import bisect_left
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle.frames import Frame
 from halfwidth.vehicle.log import Log
+from halfwidth.vehicle.sensors import AS_LOGGED, Calibration
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -28,8 +29,11 @@ MIN_STEP = 0.19
 #: Longest row of nodes put into one pause between fixes; longer pauses get longer steps.
 MAX_NODES = 3000
 
+#: A course between two samples this far apart at most is turned evenly; else one this near is that of the node, s.
+_APART, _CLOSE = 1.2, 0.06
+
 #: How fast a car changes its mind while a sensor is silent: m/s^2 and rad/s^2, up to m/s and rad/s.
-_DRIFT = {"speed": (1.5, 10.0), "yaw_rate": (0.15, 0.3)}
+DRIFT = {"speed": (1.5, 10.0), "yaw_rate": (0.15, 0.3)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +102,7 @@ class Grid:
         grid = replace(self, seen=self.seen & ~hidden, course=np.where(hidden, np.nan, self.course))
         for name in silent:
             if getattr(self, f"has_{name}"):
-                mean, sd = _silenced(self.t, hidden, getattr(self, name), getattr(self, f"{name}_sd"), *_DRIFT[name])
+                mean, sd = _silenced(self.t, hidden, getattr(self, name), getattr(self, f"{name}_sd"), *DRIFT[name])
                 changed: dict[str, Any] = {name: mean, f"{name}_sd": sd}
                 grid = replace(grid, **changed)
         return grid
@@ -107,7 +111,9 @@ class Grid:
 _ARRAYS = ("t", "east", "north", "seen", "course", "speed", "yaw_rate", "speed_sd", "yaw_rate_sd")
 
 
-def sampled(log: Log, *, clock_offset: float = 0.0, frame: Frame | None = None) -> Grid:
+def sampled(
+    log: Log, *, clock_offset: float = 0.0, frame: Frame | None = None, sensors: Calibration = AS_LOGGED
+) -> Grid:
     """Put a log on one clock.
 
     Parameters
@@ -118,6 +124,9 @@ def sampled(log: Log, *, clock_offset: float = 0.0, frame: Frame | None = None) 
         where a fix comes later than the sensors that saw the same moment.
     frame : Frame, optional
         Local axes; `Frame.of` the log if absent.
+    sensors : Calibration
+        What is known of the sensors, each put right by it. Where it knows the place of the antenna, the nodes are
+        those of the axle: `Calibration.arm` leads back.
 
     Returns
     -------
@@ -138,26 +147,28 @@ def sampled(log: Log, *, clock_offset: float = 0.0, frame: Frame | None = None) 
     frame = Frame.of(log) if frame is None else frame
     kept = fixed[_thinned(log.t[fixed])]
     t_fix = log.t[kept]
-    sensors = {name: log.stream(f"{name}{unit}") for name, unit in (("speed", "_mps"), ("yaw_rate", "_radps"))}
-    t = _nodes(log, t_fix, [clock for clock, _ in sensors.values()])
+    streams = {name: sensors.stream(log, name) for name in DRIFT}
+    t = _nodes(log, t_fix, [clock for clock, _ in streams.values()])
     at = np.searchsorted(t, t_fix)
     T = t.size
     east, north, seen = np.zeros(T), np.zeros(T), np.zeros(T, dtype=bool)
     east[at], north[at] = frame.to_local(log.lat_deg[kept], log.lon_deg[kept])
     seen[at] = True
-    mean = {name: _means(t, clock + clock_offset, values, *_DRIFT[name]) for name, (clock, values) in sensors.items()}
+    arm_east, arm_north = sensors.arm(t)
+    streams = {name: (clock + clock_offset, values) for name, (clock, values) in streams.items()}
+    sd = {name: silence(t, clock, *DRIFT[name]) for name, (clock, _) in streams.items()}
     return Grid(
         t=t,
-        east=east,
-        north=north,
+        east=east - arm_east,
+        north=north - arm_north,
         seen=seen,
-        course=_course(log, t, seen),
-        speed=mean["speed"][0],
-        yaw_rate=mean["yaw_rate"][0],
-        speed_sd=mean["speed"][1],
-        yaw_rate_sd=mean["yaw_rate"][1],
-        has_speed=sensors["speed"][0].size > 0,
-        has_yaw_rate=sensors["yaw_rate"][0].size > 0,
+        course=_course(*sensors.stream(log, "azimuth"), t, seen),
+        speed=means(t, *streams["speed"]),
+        yaw_rate=means(t, *streams["yaw_rate"]),
+        speed_sd=sd["speed"],
+        yaw_rate_sd=sd["yaw_rate"],
+        has_speed=streams["speed"][0].size > 0,
+        has_yaw_rate=streams["yaw_rate"][0].size > 0,
         frame=frame,
     )
 
@@ -187,11 +198,23 @@ def _nodes(log: Log, t_fix: Floats, clocks: list[Floats]) -> Floats:
     return np.sort(np.concatenate((marks, first + k * np.repeat(pause / (n + 1), n))))
 
 
-def _means(t: Floats, clock: Floats, values: Floats, rate: float, most: float) -> tuple[Floats, Floats]:
-    """Return the mean of a sensor over each step, and its standard deviation where the sensor was silent."""
+def means(t: Floats, clock: Floats, values: Floats) -> Floats:
+    """Return the mean of a sensor over each step.
+
+    Parameters
+    ----------
+    t : (T,) array
+        Nodes, s.
+    clock, values : (n,) arrays
+        Times, s, and samples.
+
+    Returns
+    -------
+    (T,) array
+        Over the step that ends in each node; the first repeats the second.
+    """
     if clock.size == 0 or t.size < 2:
-        level = float(values.mean()) if clock.size else 0.0
-        return np.full(t.size, level), np.zeros(t.size)
+        return np.full(t.size, float(values.mean()) if clock.size else 0.0)
     if clock.size == 1:
         clock, values = np.array([clock[0], clock[0] + 1e-3]), np.repeat(values, 2)
     step = np.diff(clock)
@@ -202,15 +225,30 @@ def _means(t: Floats, clock: Floats, values: Floats, rate: float, most: float) -
     # beyond its ends the sensor is taken to stay where it was
     total += np.minimum(t - clock[0], 0.0) * values[0] + np.maximum(t - clock[-1], 0.0) * values[-1]
     mean = np.diff(total) / np.diff(t)
-    return np.concatenate((mean[:1], mean)), _silence(t, clock, rate, most)
+    return np.concatenate((mean[:1], mean))
 
 
-def _silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
-    """Return the standard deviation of each step's mean where the sensor was silent for long.
+def silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
+    """Return the standard deviation of each step's mean where the sensor was silent for long, 0 elsewhere.
 
     The steps of one silence err together, while an estimator takes them as independent. So each is given the share of
     variance that makes the whole silence come out right: sd^2 * (length of the silence) / (length of the step).
+
+    Parameters
+    ----------
+    t : (T,) array
+        Nodes, s.
+    clock : (n,) array
+        Times of the samples, s.
+    rate, most : float
+        How fast the quantity changes while the sensor is silent, a second, and by how much at most.
+
+    Returns
+    -------
+    (T,) array
     """
+    if clock.size < 2 or t.size < 2:
+        return np.zeros(t.size)
     step = np.diff(clock)
     limit = max(3.0 * float(np.median(step)), 0.5)
     middle = t.copy()
@@ -245,9 +283,8 @@ def _silenced(t: Floats, hidden: Mask, mean: Floats, sd: Floats, rate: float, mo
     return np.where(lost, np.interp(middle, middle[~lost], mean[~lost]), mean), new
 
 
-def _course(log: Log, t: Floats, seen: Mask) -> Floats:
-    """Return the receiver's course at the nodes with a fix, from at most half a node's distance away."""
-    clock, values = log.stream("azimuth_rad")
+def _course(clock: Floats, values: Floats, t: Floats, seen: Mask) -> Floats:
+    """Return the receiver's course at the nodes with a fix, on the short way from the sample before to the next."""
     course = np.full(t.size, np.nan)
     if clock.size == 0:
         return course
@@ -255,6 +292,10 @@ def _course(log: Log, t: Floats, seen: Mask) -> Floats:
     left = np.maximum(k - 1, 0)
     k = np.minimum(k, clock.size - 1)
     near = np.where(np.abs(clock[k] - t) < np.abs(t - clock[left]), k, left)
-    close = seen & (np.abs(clock[near] - t) <= 0.06)
+    close = seen & (np.abs(clock[near] - t) <= _CLOSE)
     course[close] = values[near[close]]
+    between = seen & (t > clock[left]) & (t < clock[k]) & (clock[k] - clock[left] <= _APART)
+    turned = np.mod(values[k] - values[left] + np.pi, 2 * np.pi) - np.pi
+    share = (t - clock[left])[between] / (clock[k] - clock[left])[between]
+    course[between] = values[left][between] + share * turned[between]
     return course

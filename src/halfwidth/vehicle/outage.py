@@ -4,8 +4,11 @@ Starts are drawn at random and are the same for every method. Only the fixes (an
 speed and yaw rate stay. A start counts only if the vehicle averages more than 1 m/s in the outage, since standing still
 is no test. The error is the distance to each hidden fix. A cell of the table is the mean over all hidden fixes and the
 mean over starts of the largest error of each outage. `coverage` is the share of hidden fixes, east and north counted
-apart, inside the interval at `level` of a method that claims one: its own interval, before `fill` widens it by what
-hiding fixes shows.
+apart, inside the interval at `level` of a method that claims one: its own interval, before `fill` sizes it by what
+hiding fixes shows. `held` is the share inside once each outage's interval is sized by the other outages of its length
+that do not overlap with it, as `fill` sizes gaps by stretches elsewhere in the log.
+
+Clocks and scales of the sensors are found from the whole log, hidden fixes included: a handful of numbers.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,11 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth.errors import BadLog, BadValue
+from halfwidth.errors import BadLog, BadValue, Missing
+from halfwidth.vehicle.align import calibrated
+from halfwidth.vehicle.calibrate import FEWEST, quantile
 from halfwidth.vehicle.estimators import METHODS, Method, method, usable
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log, to_frame
-from halfwidth.vehicle.path import Path
+from halfwidth.vehicle.path import Path, sized
 
 Floats = NDArray[np.float64]
 
@@ -33,6 +38,9 @@ MARGIN = 20.0
 
 #: The vehicle must average more than this in an outage, m/s.
 MIN_SPEED = 1.0
+
+#: Error that is tolerated, m: the band of Pavelková's slides on GPS and CAN data.
+TOLERANCE = 0.5
 
 Progress = Callable[[float, str], None]
 
@@ -52,9 +60,14 @@ class Cell:
         Mean and largest distance to the hidden fixes of each outage, m.
     n_fixes : (n,) int array
         Hidden fixes of each outage.
-    inside : (n,) array or None
-        Share of them inside the method's own interval, before `fill` would widen it, each axis by itself; None where
-        the method claims no interval.
+    needed : tuple of (2 n_fixes,) arrays
+        For each hidden fix of each outage and each axis, the factor on the method's interval that just reaches it.
+    claims : bool
+        Whether the method claims an interval by itself; else its shape is the time to the nearest fix.
+    level : float
+        Level of the interval.
+    half : (n,) array
+        Mean half-width at the hidden fixes before it is sized, m.
     failed : int
         Outages in which the method found no usable path; there the straight line was counted instead.
     seconds : float
@@ -67,7 +80,10 @@ class Cell:
     mean_error: Floats = field(repr=False)
     max_error: Floats = field(repr=False)
     n_fixes: NDArray[np.int64] = field(repr=False)
-    inside: Floats | None = field(repr=False)
+    needed: tuple[Floats, ...] = field(repr=False)
+    claims: bool
+    level: float
+    half: Floats = field(repr=False)
     failed: int
     seconds: float
 
@@ -103,8 +119,31 @@ class Cell:
 
     @property
     def coverage(self) -> float | None:
-        """Share of hidden fixes inside the method's own interval, before widening; None where it claims none."""
-        return None if self.inside is None else float(np.average(self.inside, weights=self.n_fixes))
+        """Share of hidden fixes inside the method's own interval, before it is sized; None where it claims none."""
+        return float(np.mean(np.concatenate(self.needed) <= 1.0)) if self.claims else None
+
+    @property
+    def factors(self) -> Floats:
+        """(n,) array: factor on the interval of each outage that the other ones ask for; NaN with too few of them."""
+        found = np.full(self.n, np.nan)
+        for k in range(self.n):
+            others = np.flatnonzero(np.abs(self.start - self.start[k]) > self.length)
+            if others.size >= FEWEST:
+                found[k] = quantile([self.needed[i] for i in others], self.level)
+        return found
+
+    @property
+    def held(self) -> float | None:
+        """Share of hidden fixes inside intervals sized by the other outages; None with too few of them."""
+        shares = [n <= f for n, f in zip(self.needed, self.factors, strict=True) if np.isfinite(f)]
+        return float(np.mean(np.concatenate(shares))) if shares else None
+
+    @property
+    def half_width(self) -> float | None:
+        """Mean half-width of the intervals so sized, m; None with too few outages."""
+        sized_to = self.factors * self.half
+        known = np.isfinite(sized_to)
+        return float(sized_to[known].mean()) if known.any() else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +160,11 @@ class Outages:
         Level of the intervals.
     seed : int
     clock_offset : float
-        Seconds added to the time stamps of speed and yaw rate.
+        Seconds added to the time stamps of speed and yaw rate; NaN where each has its own, found from the log.
     skipped : mapping of str to str
         Methods and lengths that could not be tried, and why.
+    sensors : mapping
+        What was found of the sensors and applied, see `Calibration.to_dict`.
     """
 
     source: str
@@ -132,6 +173,7 @@ class Outages:
     seed: int
     clock_offset: float
     skipped: Mapping[str, str] = field(default_factory=dict)
+    sensors: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -166,7 +208,8 @@ class Outages:
         Returns
         -------
         DataFrame or Table
-            ``method, length_s, starts, mean_m, mean_se_m, max_m, max_se_m, worst_m, coverage, failed, seconds``.
+            ``method, length_s, starts, mean_m, mean_se_m, max_m, max_se_m, worst_m, coverage, held, half_m, failed,
+            seconds``.
         """
         return to_frame({name: np.array(values) for name, values in self._columns().items()}, native)
 
@@ -186,7 +229,9 @@ class Outages:
             "max_m": [c.max for c in cells],
             "max_se_m": [c.max_se for c in cells],
             "worst_m": [c.worst for c in cells],
-            "coverage": [np.nan if c.coverage is None else c.coverage for c in cells],
+            "coverage": [_number(c.coverage) for c in cells],
+            "held": [_number(c.held) for c in cells],
+            "half_m": [_number(c.half_width) for c in cells],
             "failed": [c.failed for c in cells],
             "seconds": [c.seconds for c in cells],
         }
@@ -204,17 +249,21 @@ class Outages:
         for m in self.methods:
             row = [self._found(m, length) for length in lengths]
             lines.append(f"{m:{name}}" + "".join(f"{_pair(c):>16}" for c in row))
-        covered = [c for c in self.cells if c.coverage is not None]
-        if covered:
-            lines += [
-                "",
-                f"share of hidden fixes inside the methods' own {100 * self.level:g} % interval, before widening",
-                head,
-            ]
-            for m in dict.fromkeys(c.method for c in covered):
+        percent = f"{100 * self.level:g} %"
+        for what, words in (
+            ("coverage", f"share of hidden fixes inside the methods' own {percent} interval, before it is sized"),
+            ("held", f"share of hidden fixes inside {percent} intervals sized by the other outages"),
+        ):
+            covered = [c.method for c in self.cells if getattr(c, what) is not None]
+            if not covered:
+                continue
+            lines += ["", words, head]
+            for m in dict.fromkeys(covered):
                 row = [self._found(m, length) for length in lengths]
-                shares = ["" if c is None or c.coverage is None else f"{c.coverage:.2f}" for c in row]
-                lines.append(f"{m:{name}}" + "".join(f"{s:>16}" for s in shares))
+                found = [None if c is None else getattr(c, what) for c in row]
+                lines.append(f"{m:{name}}" + "".join(f"{'' if v is None else f'{v:.2f}':>16}" for v in found))
+        lines += ["", f"longest outage whose mean largest error is within {TOLERANCE:g} m, s"]
+        lines += [f"{m:{name}}{found:>16.3g}" for m, found in self.within().items()]
         return "\n".join([*lines, *self._notes()])
 
     def _found(self, name: str, length: float) -> Cell | None:
@@ -234,17 +283,84 @@ class Outages:
             )
         return ["", *notes] if notes else []
 
+    def within(self, tolerance: float = TOLERANCE) -> dict[str, float]:
+        """Return for each method how long an outage may last before its mean largest error exceeds a tolerance.
+
+        Between the lengths that were tried it is interpolated in the logarithms of length and error.
+
+        Parameters
+        ----------
+        tolerance : float
+            m.
+
+        Returns
+        -------
+        dict of str to float
+            Seconds; 0 where the shortest outage is beyond the tolerance, the longest tried where none is.
+        """
+        found = {}
+        for m in self.methods:
+            cells = sorted((c for c in self.cells if c.method == m), key=lambda c: c.length)
+            beyond = next((k for k, c in enumerate(cells) if c.max > tolerance), None)
+            if beyond is None:
+                found[m] = cells[-1].length
+            elif beyond == 0:
+                found[m] = 0.0
+            else:
+                a, b = cells[beyond - 1], cells[beyond]
+                share = np.log(tolerance / max(a.max, 1e-9)) / np.log(b.max / max(a.max, 1e-9))
+                found[m] = float(np.exp(np.log(a.length) + share * np.log(b.length / a.length)))
+        return found
+
+    def plot(self, ax: Any = None, *, tolerance: float = TOLERANCE) -> Any:
+        """Plot error against the length of the outage: the mean, thin lines the mean of the largest.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+        tolerance : float
+            Where the line of the tolerated error is drawn, m (Pavelková's slides on GPS and CAN data: 0.5 m).
+
+        Returns
+        -------
+        matplotlib Axes
+
+        Raises
+        ------
+        Missing
+            If matplotlib is not installed.
+        """
+        try:
+            import matplotlib.pyplot as plt
+        except ImportError as exc:
+            raise Missing("`plot` needs matplotlib", hint="pip install 'halfwidth[plot]'") from exc
+        ax = plt.figure(figsize=(7, 4.5), layout="constrained").add_subplot() if ax is None else ax
+        for m in self.methods:
+            cells = sorted((c for c in self.cells if c.method == m), key=lambda c: c.length)
+            t = [c.length for c in cells]
+            (line,) = ax.loglog(t, [max(c.mean, 1e-4) for c in cells], marker="o", markersize=3, label=m)
+            ax.loglog(t, [max(c.max, 1e-4) for c in cells], color=line.get_color(), linewidth=0.6, linestyle="--")
+        ax.axhline(tolerance, color="black", linewidth=0.8, label=f"tolerance {tolerance:g} m")
+        ax.set_xticks(self.lengths, [f"{length:g}" for length in self.lengths])
+        ax.minorticks_off()
+        ax.set_xlabel("length of the outage, s")
+        ax.set_ylabel("error, m: mean, dashed largest")
+        ax.legend(fontsize="small")
+        return ax
+
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the single errors as plain data, for JSON.
 
-        `coverage` of a cell is that of the method's own interval, as `interval` says: `fill` widens it before it
-        claims anything.
+        `coverage` of a cell is that of the method's own interval; `held` that of intervals sized by the other outages.
         """
         return {
             "level": self.level,
-            "interval": "of the method itself, before widening",
+            "interval": "coverage: of the method itself; held: sized by the other outages",
             "seed": self.seed,
-            "clock_offset": self.clock_offset,
+            "clock_offset": _plain(self.clock_offset),
+            "sensors": dict(self.sensors),
+            "tolerance_m": TOLERANCE,
+            "longest_within_s": self.within(),
             "skipped": dict(self.skipped),
             "cells": self.rows(),
         }
@@ -286,7 +402,7 @@ def outages(
     methods : sequence of str, optional
         Names of estimators; all that the log's sensors allow if absent.
     clock_offset : float, optional
-        Seconds to add to the time stamps of speed and yaw rate, see `sampled`; 0 if absent.
+        Seconds to add to the time stamps of speed and yaw rate; found from the log, for each by itself, if absent.
     level : float
         Level of the intervals whose coverage is counted.
     progress : function (share, words), optional
@@ -315,10 +431,12 @@ def outages(
         raise BadValue(f"`lengths` is {lengths!r}, positive numbers of seconds are expected", hint="lengths=(1, 5, 30)")
     if not isinstance(starts, int) or starts < 1:
         raise BadValue(f"`starts` is {starts!r}, a whole number from 1 is expected", hint="starts=20")
-    level, offset = level_of(level), clock_offset_of(clock_offset)
+    level = level_of(level)
+    offset = None if clock_offset is None else clock_offset_of(clock_offset)
     drive_log: Log = as_log(log)[0]
     chosen = [method(name) for name in (METHODS if methods is None else methods)]
-    drive = sampled(drive_log, clock_offset=offset)
+    sensors = calibrated(drive_log, clock_offset=offset)
+    drive = sampled(drive_log, sensors=sensors)
     if int(drive.seen.sum()) < 3:
         raise BadLog(f"the log has {int(drive.seen.sum())} fixes, at least 3 are expected to hide some")
     skipped = {m.name: f"the log has no {lack}" for m in chosen if (lack := m.lacks(drive))}
@@ -344,7 +462,9 @@ def outages(
             cells.append(_cell(drive, m, tuned, length, places[length], level))
     if progress is not None:
         progress(1.0, "done")
-    return Outages(drive_log.source, tuple(cells), level, seed, offset, MappingProxyType(skipped))
+    given_offset = float("nan") if offset is None else offset
+    known = MappingProxyType(sensors.to_dict())
+    return Outages(drive_log.source, tuple(cells), level, seed, given_offset, MappingProxyType(skipped), known)
 
 
 def _starts(drive: Grid, length: float, n: int, seed: int) -> Floats:
@@ -404,7 +524,7 @@ def _cell(drive: Grid, m: Method, tuned: Mapping[str, float], length: float, beg
     paths = m.run(hidden, tuned)
     seconds = perf_counter() - clock
     z = NormalDist().inv_cdf(0.5 + level / 2)
-    means, largest, counts, inside, failed = [], [], [], [], 0
+    means, largest, counts, needed, halves, failed, claims = [], [], [], [], [], 0, True
     for full, part, found in zip(whole, hidden, paths, strict=True):
         path: Path = found
         if not usable(path):
@@ -416,11 +536,26 @@ def _cell(drive: Grid, m: Method, tuned: Mapping[str, float], length: float, beg
         means.append(distance.mean())
         largest.append(distance.max())
         counts.append(distance.size)
-        if path.variance is not None:
-            half = z * np.sqrt(path.variance[out] + path.fix_variance)
-            inside.append(float(np.mean(np.abs(error) <= half)))
-    claimed = np.array(inside) if len(inside) == len(begin) else None
-    return Cell(m.name, length, begin, np.array(means), np.array(largest), np.array(counts), claimed, failed, seconds)
+        claims = claims and path.variance is not None
+        path = sized(path, part)
+        spread = np.zeros((len(full), 2)) if path.variance is None else path.variance
+        half = np.maximum(z * np.sqrt(spread[out] + path.fix_variance), 1e-9)
+        needed.append((np.abs(error) / half).ravel())
+        halves.append(half.mean())
+    return Cell(
+        method=m.name,
+        length=length,
+        start=begin,
+        mean_error=np.array(means),
+        max_error=np.array(largest),
+        n_fixes=np.array(counts),
+        needed=tuple(needed),
+        claims=claims,
+        level=level,
+        half=np.array(halves),
+        failed=failed,
+        seconds=seconds,
+    )
 
 
 def _standard_error(values: Floats) -> float:
@@ -429,6 +564,10 @@ def _standard_error(values: Floats) -> float:
 
 def _pair(cell: Cell | None) -> str:
     return "" if cell is None else f"{cell.mean:.2f} / {cell.max:.2f}"
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
 
 
 def _plain(value: Any) -> Any:

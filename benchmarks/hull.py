@@ -1,0 +1,185 @@
+"""Guaranteed boxes: how often they are wrong, how wide they are, how long they take.
+
+    python benchmarks/hull.py                    speed and width beside the peers
+    python benchmarks/hull.py --violations N     N state-steps of simulated truth, counted while they run
+    python benchmarks/hull.py --violations N --resume FILE     goes on where FILE stopped, and writes it
+
+A state-step is one entry of one state checked against its box. The noise sits at the corners of its box most of the
+time, 30 % of the outputs are missing, and every series has whole outages. The simulated noise is 1e-12 smaller than the
+half-widths declared, because the simulation itself rounds.
+"""
+
+import argparse
+import itertools
+import json
+import os
+import pathlib
+import time
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np  # noqa: E402
+
+import halfwidth as hw  # noqa: E402
+
+NAN = np.nan
+EVERY = 30.0  # s between two lines of progress
+
+
+def paper003(_):
+    """The three-state system of paper 003 with half of its noise."""
+    A = np.array([[0.4, -0.3, 0.1], [-0.4, 0.4, 0.0], [0.3, 0.2, 0.2]])
+    B = np.array([[1.0], [0.5], [-0.3]])
+    C = np.array([[1.0, 0.0, 0.3], [0.0, 1.0, 0.0]])
+    return hw.Linear(A, B, C, hw.Uniform(0.1), hw.Uniform(0.3), hw.Box(-np.ones(3), np.ones(3))), 3
+
+
+def vehicle(_):
+    """Position and speed on two axes."""
+    car = hw.vehicle.constant_velocity(dt=0.1, q=[0.02, 0.02, 0.05, 0.05], r=[0.5, 0.5])
+    box = hw.Box(-np.array([5.0, 5, 8, 8]), np.array([5.0, 5, 8, 8]))
+    return hw.Linear(car.A, car.B, car.C, car.w, car.e, box, dt=car.dt), 4
+
+
+def drawn(rng):
+    """A random system of 1 to 5 states with E, F, bounds on the states or none, and half-widths of any size."""
+    n = int(rng.integers(1, 6))
+    m = int(rng.integers(1, n + 1))
+    A = rng.standard_normal((n, n))
+    A *= rng.uniform(0.3, 1.02) / np.abs(np.linalg.eigvals(A)).max()
+    E = np.eye(n) + np.triu(0.3 * rng.standard_normal((n, n)), 1) if rng.random() < 0.5 else None
+    F = np.eye(m) + np.triu(0.3 * rng.standard_normal((m, m)), 1) if rng.random() < 0.5 else None
+    q = 10.0 ** rng.uniform(-4, 0, n) * (rng.random(n) < 0.9)
+    size = 10.0 ** rng.uniform(-2, 2)
+    x0 = hw.Box(-size * np.ones(n), size * np.ones(n)) if rng.random() < 0.8 else None
+    r = 10.0 ** rng.uniform(-3, 0.5, m)
+    return hw.Linear(
+        A, rng.standard_normal((n, 1)), rng.standard_normal((m, n)), hw.Uniform(q), hw.Uniform(r), x0, E=E, F=F
+    ), n
+
+
+def corners(rng, T, half):
+    """Noise at the corners of its box: kept there for a while, jumping, or anywhere."""
+    n = half.size
+    kind = rng.integers(4)
+    if kind == 0:
+        signs = rng.choice([-1.0, 1.0], (T, n))
+    elif kind == 1:
+        turns = rng.random((T, n)) < 0.1
+        signs = np.where(np.cumsum(turns, axis=0) % 2 == 0, 1.0, -1.0) * rng.choice([-1.0, 1.0], n)
+    elif kind == 2:
+        signs = np.broadcast_to(rng.choice([-1.0, 1.0], n), (T, n))
+    else:
+        signs = np.where(rng.random((T, n)) < 0.5, rng.choice([-1.0, 1.0], (T, n)), rng.uniform(-1, 1, (T, n)))
+    return signs * half * (1 - 1e-12)
+
+
+def series(model, rng, T):
+    """Draw truth (T, nx) and a record with 30 % of the outputs missing and whole outages."""
+    A, B, C = model.A.single, model.B.single, model.C.single
+    E = np.eye(model.nx) if model.E is None else model.E.single
+    F = np.eye(model.ny) if model.F is None else model.F.single
+    u = rng.uniform(-1, 1, (T, model.nu))
+    w, e = corners(rng, T, model.w.q), corners(rng, T, model.e.q)
+    x = np.empty((T, model.nx))
+    lo, hi = np.maximum(model.x0.lo, -1.0), np.minimum(model.x0.hi, 1.0)
+    state = np.where(rng.random(model.nx) < 0.5, lo, hi) if rng.random() < 0.5 else rng.uniform(lo, hi)
+    for t in range(T):
+        state = np.linalg.solve(E, A @ state + B @ u[t] + w[t])
+        x[t] = state
+    y = np.linalg.solve(F, (x @ C.T + e).T).T
+    y[rng.random(y.shape) < 0.3] = NAN
+    for _ in range(max(1, T // 60)):
+        start = int(rng.integers(0, T))
+        y[start : start + int(rng.integers(3, 25))] = NAN
+    return x, hw.Record(np.arange(1, T + 1) * model.dt, y, u)
+
+
+KINDS = (paper003, vehicle, drawn, drawn)
+METHODS = (hw.Hull(memory=10), hw.Hull(memory=5, lag=3), hw.Hull(), hw.Hull(lag=0))
+
+
+def one(seed, T=100, method=None):
+    """Run one series; return state-steps, violations, loose sides, sides, and the worst depth of a violation."""
+    rng = np.random.default_rng([8, seed])
+    model, _ = KINDS[seed % 4](rng)
+    if method is None:
+        method = METHODS[(seed // 32) % 4] if seed % 32 >= 28 else hw.Hull(memory=5)  # the cheapest counts fastest
+    x, record = series(model, rng, T)
+    # A solve with E rounds, too: the noise that the simulated truth really obeys is what is declared.
+    model = declared(model, x, record)
+    est = hw.estimate(model, record, method)
+    if not est.status.good:
+        return x.size, x.size, 0, 0, f"seed {seed}: {est.message}"
+    lo, hi = est.interval()
+    out = (x < lo) | (x > hi)
+    worst = f"seed {seed}: by {float(np.maximum(lo - x, x - hi).max()):.3g}" if out.any() else ""
+    return x.size, int(out.sum()), est.info["loose"], est.info["sides"], worst
+
+
+def declared(model, x, record):
+    """Widen the half-widths by what the simulation rounds: 1e-12 of the size of the terms."""
+    size = np.abs(model.A.single) @ np.abs(x).max(axis=0) + np.abs(x).max() * 4 + np.abs(model.B.single).sum(axis=1)
+    seen = np.where(record.seen, np.abs(np.nan_to_num(record.y)), 0.0).max(axis=0)
+    outs = np.abs(model.C.single) @ np.abs(x).max(axis=0) + 4 * seen.max()
+    w, e = hw.Uniform(model.w.q + 1e-13 * size), hw.Uniform(model.e.q + 1e-13 * outs)
+    return hw.Linear(model.A, model.B, model.C, w, e, model.x0, E=model.E, F=model.F, dt=model.dt)
+
+
+def violations(target, path):
+    """Count violations over at least `target` state-steps."""
+    total = {"seed": 0, "state_steps": 0, "violations": 0, "loose": 0, "sides": 0, "cpu_s": 0.0, "worst": []}
+    if path is not None and path.exists():
+        total = json.loads(path.read_text())
+        print(f"resumed at {total['state_steps']:,} state-steps")
+    said = time.monotonic()
+    begin, before = time.process_time(), total["cpu_s"]
+    for seed in itertools.count(total["seed"]):
+        if total["state_steps"] >= target:
+            break
+        steps, out, loose, sides, worst = one(seed)
+        total["seed"] = seed + 1
+        total["state_steps"] += steps
+        total["violations"] += out
+        total["loose"] += loose
+        total["sides"] += sides
+        total["cpu_s"] = before + time.process_time() - begin
+        if worst:
+            total["worst"].append(worst)
+            print(worst, flush=True)
+        if time.monotonic() - said > EVERY:
+            said = time.monotonic()
+            report(total)
+            save(path, total)
+    report(total)
+    save(path, total)
+    return total["violations"]
+
+
+def report(total):
+    print(
+        f"{total['state_steps']:>14,} state-steps in {total['seed']:,} series: {total['violations']} violations, "
+        f"{total['loose']} of {total['sides']:,} sides loose, {total['cpu_s']:.0f} s",
+        flush=True,
+    )
+
+
+def save(path, total):
+    if path is not None:
+        temporary = path.with_suffix(".part")
+        temporary.write_text(json.dumps(total))
+        temporary.replace(path)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--violations", type=float, metavar="N")
+    parser.add_argument("--resume", type=pathlib.Path, metavar="FILE")
+    given = parser.parse_args()
+    if given.violations is not None:
+        raise SystemExit(1 if violations(given.violations, given.resume) else 0)
+
+
+if __name__ == "__main__":
+    main()

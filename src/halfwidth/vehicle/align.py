@@ -1,0 +1,486 @@
+"""Calibration from the log itself: clocks, speed scale, yaw bias, antenna, units and signs, standstill, steps.
+
+The fixes are the reference. Units and signs come first, as they are factors that no sensor error comes near. Then the
+clock of each stream is looked for roughly, by sliding it along what fixes a second or a few apart show of it, and then
+finely by dead reckoning (`reckoning`), piece by piece of some minutes. The pieces are independent, so their information
+adds up, and their scatter about the common answer says whether it can be believed: standard deviations are widened by
+it where it is larger than they say, a clock that stepped or drifts shows as pieces that disagree in order of time, and
+an offset that stays vague is called not observable and not applied. A wrong clock poisons scale and bias, so all of
+them are unknowns of one problem.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.vehicle import evidence, reckoning
+from halfwidth.vehicle.frames import wrapped
+from halfwidth.vehicle.grid import Grid, sampled
+from halfwidth.vehicle.log import STREAMS, Log
+from halfwidth.vehicle.repair import contradicted_yaw, matched_factor
+from halfwidth.vehicle.sensors import AS_LOGGED, STREAM, Calibration, Offset
+
+Floats = NDArray[np.float64]
+
+#: A piece lasts about this long, s; so many are looked at, at most; a pause of all streams ends one, s.
+PIECE, MOST_PIECES, PAUSE = 150.0, 40, 30.0
+
+#: Fixes that a piece needs, and metres that the car must have moved in it.
+FEWEST, LEAST_WAY = 20, 30.0
+
+#: Offsets are looked for this far either way, s, and are observable when their standard deviation is below, s.
+WIDEST, OBSERVABLE = 2.5, 0.15
+
+#: An antenna off the axle is believed when it is this many standard deviations off, known to this many metres, and the
+#: slow error of the fixes moves by less than this many metres in the time of a turn (10 s).
+ANTENNA_SIGMAS, ANTENNA_SD, ANTENNA_SLOW = 5.0, 0.3, 0.3
+
+#: Slower than this a car stands, m/s; times this near to moving are not counted, s; the least length, s.
+STANDING, EDGE, SHORTEST = 0.1, 1.0, 1.0
+
+#: The bias is told every so many seconds.
+KNOT = 30.0
+
+#: A change of a clock is believed if it makes the misfit of the pieces smaller by this much, and is this large, s.
+CHANGE_GAIN, CHANGE_LEAST = 25.0, 0.05
+
+#: Rounds with the antenna on the axle, then off it.
+_ROUNDS, _MORE = 12, 6
+
+_SENSORS = ("speed", "yaw_rate")
+
+
+def calibrated(log: Log, *, clock_offset: float | None = None) -> Calibration:
+    """Find clocks, scale, bias, antenna, units and signs of a log from the log itself.
+
+    Parameters
+    ----------
+    log : Log
+    clock_offset : float, optional
+        Seconds to add to the time stamps of speed and yaw rate, where they are known; found if absent.
+
+    Returns
+    -------
+    Calibration
+        Also for a log that tells nothing: then it says so and changes nothing.
+    """
+    known = replace(AS_LOGGED, steps=steps_of(log))
+    fixes = int(log.fixed.sum())
+    there = [name for name in _SENSORS if np.isfinite(getattr(log, STREAM[name])).any()]
+    given = Offset() if clock_offset is None else Offset(float(clock_offset), 0.0, True, given=True)
+    known = replace(known, offsets=dict.fromkeys(there, given))
+    if fixes < FEWEST or not there:
+        return known
+    known = _units(log, known)
+    rough = _Rough.of(log, known)
+    first = {name: given.seconds if given.given else rough.offset(name) for name in there}
+    start = {name: Offset(seconds, 0.0, True) for name, seconds in first.items()}
+    known = replace(known, still=standstills(log, replace(known, offsets=start)))
+    grid = sampled(log)
+    parts = _parts(grid)
+    streams = {name: replace(known, offsets={}, still=AS_LOGGED.still).stream(log, name) for name in _SENSORS}
+    if "speed" not in there:
+        streams["speed"] = _speed_of_fixes(grid)
+    solved = [_solved(part, streams, known, rough, first, fixed=given.given) for part in parts]
+    pieces = [piece for piece in solved if piece.sound]
+    if not pieces:
+        return known
+    known = _joined(known, pieces, there, given)
+    off = _antenna(parts, streams, known, solved, given)
+    if off is not None:
+        known = off
+    known = _azimuth(log, known, pieces)
+    t, rate = replace(known, bias=0.0, bias_at=(), still=AS_LOGGED.still).stream(log, "yaw_rate")
+    standing = rate[known.stands(t)]
+    return replace(known, still_bias=float(np.median(standing))) if standing.size >= 5 else known
+
+
+def steps_of(log: Log) -> dict[str, float]:
+    """Return the quantisation step of each stream that has one, in units of the log."""
+    found = {}
+    for name in STREAMS:
+        values = log.stream(name)[1]
+        step = quantisation(values) if values.size >= 20 else None
+        if step is not None:
+            found[name] = step
+    return found
+
+
+def quantisation(values: Floats) -> float | None:
+    """Give the step that all values are multiples of, None if they have none.
+
+    Rounding of the step itself is allowed for: 5 km/h written as 1.3889 m/s counts.
+
+    Parameters
+    ----------
+    values : (n,) array
+
+    Returns
+    -------
+    float or None
+    """
+    distinct = np.unique(values)
+    if distinct.size < 3:
+        return None
+    offset = distinct - distinct[0]
+    step = np.diff(distinct)
+    step = step[step > 1e-9 * max(1.0, float(np.abs(distinct).max()))]
+    if step.size == 0:
+        return None
+    guess = float(np.quantile(step, 0.02, method="lower"))
+    whole = np.round(offset / guess)
+    # a wrong guess of a coarse step adds up: fit it over near multiples first
+    near = (whole > 0) & (whole < 50)
+    if near.any():
+        guess = float(np.median(offset[near] / whole[near]))
+        whole = np.round(offset / guess)
+    off = np.abs(offset / guess - whole)
+    return guess if float((off < 0.12).mean()) > 0.95 else None
+
+
+def _units(log: Log, known: Calibration) -> Calibration:
+    """Settle units and signs that the fixes contradict beyond doubt."""
+    speed = matched_factor(evidence.speed_ratio(log)) if "speed" in known.offsets else None
+    yaw = contradicted_yaw(evidence.turning(log)) if "yaw_rate" in known.offsets else None
+    messages = []
+    if speed is not None and speed[3] == 1:
+        messages.append(f"{speed[1]}, as distances between fixes say (ratio {speed[0]:.3g}): taken so")
+        known = replace(known, speed_factor=speed[2])
+    if yaw is not None:
+        words = "in deg/s" if abs(yaw) < 0.5 else "in rad/s, not deg/s" if abs(yaw) > 2 else ""
+        words += (" and " if words and yaw < 0 else "") + ("positive to the right" if yaw < 0 else "")
+        messages.append(f"yaw rate is {words}, as courses between fixes say: taken so")
+        known = replace(known, yaw_factor=yaw)
+    return replace(known, messages=tuple(messages))
+
+
+def standstills(log: Log, known: Calibration) -> Floats:
+    """Find the times at which the car surely stands, (n, 2), s: the speed is zero, and has been for a while."""
+    t, speed = known.stream(log, "speed")
+    if t.size < 3:
+        return np.empty((0, 2))
+    low = np.abs(speed) < max(STANDING, 0.5 * known.steps.get("speed_mps", 0.0) * abs(known.speed_factor))
+    edge = np.flatnonzero(np.diff(np.concatenate(([0], low.astype(np.int8), [0]))))
+    first, last = t[edge[::2]] + EDGE, t[edge[1::2] - 1] - EDGE
+    long = last - first >= SHORTEST
+    return np.column_stack((first[long], last[long]))
+
+
+# ---- a rough look --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Rough:
+    """How badly each offset of a stream fits what the fixes show: medians over windows."""
+
+    lags: Floats  # (L,)
+    when: dict[str, Floats]  # middle of each window
+    misfit: dict[str, Floats]  # (windows, L)
+
+    @classmethod
+    def of(cls, log: Log, known: Calibration) -> "_Rough":
+        t_fix = log.t[log.fixed]
+        usual = float(np.median(np.diff(t_fix)))
+        lags = np.arange(-WIDEST, WIDEST + 1e-9, max(0.1, min(usual, 1.0) / 4))
+        when, misfit = {}, {}
+        plain = replace(known, offsets={})
+        span = max(1.0, usual)
+        chord = evidence.windows(log, span)
+        middle, took = 0.5 * (chord.start + chord.stop), chord.stop - chord.start
+        t, v = plain.stream(log, "speed")
+        if t.size > 2 and middle.size:
+            found = np.stack([np.abs(evidence.integral(t + lag, v, chord.start, chord.stop)) / took for lag in lags], 1)
+            when["speed"] = middle
+            pace = chord.distance / took
+            usable = np.isfinite(found).all(axis=1) & (pace > 1.0)
+            scale = (
+                float(np.median(pace[usable] / np.maximum(np.median(found[usable], axis=1), 0.5)))
+                if usable.any()
+                else 1.0
+            )
+            misfit["speed"] = np.abs(scale * found - pace[:, None])
+        t, w = plain.stream(log, "yaw_rate")
+        if t.size > 2 and middle.size > 2:
+            moving = chord.distance > np.maximum(2.0, 1.0 * took)
+            at, course = middle[moving], chord.course[moving]
+            later = np.searchsorted(at, at + 5.0)
+            there = later < at.size
+            there[there] &= at[later[there]] - at[there] < 8.0
+            a, b = at[there], at[later[there]]
+            turned = wrapped(course[later[there]] - course[there])
+            found = np.stack([-evidence.integral(t + lag, w, a, b) for lag in lags], 1)
+            when["yaw_rate"] = 0.5 * (a + b)
+            misfit["yaw_rate"] = np.abs(wrapped(found - turned[:, None]))
+        return cls(lags, when, misfit)
+
+    def offset(self, name: str, start: float = -np.inf, stop: float = np.inf) -> float:
+        """Return the offset that fits best between two times, 0 where none is clearly better than none, s."""
+        if name not in self.misfit:
+            return 0.0
+        inside = (self.when[name] >= start) & (self.when[name] <= stop)
+        rows = self.misfit[name][inside]
+        rows = rows[np.isfinite(rows).all(axis=1)]
+        if len(rows) < FEWEST:
+            return 0.0
+        # what no offset explains is not counted more than what the best one explains badly
+        cap = 4.0 * max(float(np.median(rows.min(axis=1))), float(np.median(rows)), 1e-6)
+        cost = np.minimum(rows, cap).mean(axis=0)
+        k = int(np.argmin(cost))
+        none = float(np.interp(0.0, self.lags, cost))
+        return float(self.lags[k]) if cost[k] < 0.9 * none else 0.0
+
+
+# ---- piece by piece ------------------------------------------------------------------------------------------------
+
+
+def _parts(grid: Grid) -> list[Grid]:
+    """Cut a drive into pieces in which there is something to see, evenly spread if there are many."""
+    ends = np.flatnonzero(np.diff(grid.t[grid.seen]) > PAUSE)
+    fixes = grid.t[grid.seen]
+    blocks = zip(np.concatenate(([0], ends + 1)), np.concatenate((ends, [fixes.size - 1])), strict=True)
+    parts = []
+    for a, b in blocks:
+        n = max(1, round((fixes[b] - fixes[a]) / PIECE))
+        cuts = np.linspace(fixes[a], fixes[b], n + 1)
+        parts += [grid.between(lo - 1e-9, hi + 1e-9) for lo, hi in pairwise(cuts)]
+    able = [part for part in parts if int(part.seen.sum()) >= FEWEST and _way(part) >= LEAST_WAY]
+    if len(able) > MOST_PIECES:
+        able = [able[k] for k in np.linspace(0, len(able) - 1, MOST_PIECES).astype(int)]
+    return able
+
+
+def _way(part: Grid) -> float:
+    """Return how far the car got, m: the longest way from the first fix."""
+    east, north = part.east[part.seen], part.north[part.seen]
+    return float(np.hypot(east - east[0], north - north[0]).max())
+
+
+def _speed_of_fixes(grid: Grid) -> tuple[Floats, Floats]:
+    """Return a speed for a log without one: that between fixes a second apart."""
+    seen = np.flatnonzero(grid.seen)
+    t = grid.t[seen]
+    ahead = np.minimum(np.searchsorted(t, t + 1.0 - 1e-6), t.size - 1)
+    took = t[ahead] - t
+    good = took > 0
+    way = np.hypot(grid.east[seen[ahead]] - grid.east[seen], grid.north[seen[ahead]] - grid.north[seen])
+    middle = 0.5 * (t[ahead] + t)[good]
+    new = np.concatenate(([True], np.diff(middle) > 1e-6))
+    return middle[new], (way[good] / took[good])[new]
+
+
+def _solved(
+    part: Grid, streams: reckoning.Streams, known: Calibration, rough: _Rough, first: dict[str, float], *, fixed: bool
+) -> reckoning.Piece:
+    """Solve one piece from its own rough offsets; from those of the drive if that fits better."""
+    common = tuple(first.get(name, 0.0) for name in _SENSORS)
+    own = tuple(
+        rough.offset(name, part.t[0], part.t[-1]) if not fixed and name in first else common[k]
+        for k, name in enumerate(_SENSORS)
+    )
+    still = _still(part, known)
+    piece = reckoning.solve(part, streams, still, (common[0], common[1]), fixed_clocks=fixed, rounds=_ROUNDS)
+    if max(abs(a - b) for a, b in zip(common, own, strict=True)) > 0.3:
+        other = reckoning.solve(part, streams, still, (own[0], own[1]), fixed_clocks=fixed, rounds=_ROUNDS)
+        if other.loglik > piece.loglik + 10.0:
+            return other
+    return piece
+
+
+def _still(part: Grid, known: Calibration) -> NDArray[np.bool_]:
+    """Return over which steps of a grid the car stands."""
+    before = np.concatenate((part.t[:1], part.t[:-1]))
+    return known.stands(part.t) & known.stands(before)
+
+
+# ---- all pieces together -------------------------------------------------------------------------------------------
+
+
+def _joined(known: Calibration, pieces: Sequence[reckoning.Piece], there: Sequence[str], given: Offset) -> Calibration:
+    """Add up what the pieces say; find out whether a clock changes."""
+    mean, sd, spread = _together(pieces)
+    offsets = {}
+    for name in there:
+        k = 1 + _SENSORS.index(name)
+        if given.given:
+            offsets[name] = given
+        else:
+            offsets[name] = _offset(pieces, k, float(mean[k]), float(sd[k] * max(1.0, spread[k])))
+    bias = np.array([piece.bias.mean() for piece in pieces])
+    # a bias drifts: the pieces count by how long they are sure of it, not by how sure
+    variance = np.array([piece.bias_sd**2 for piece in pieces])
+    weight = 1.0 / (variance + max(float(np.var(bias)) - float(np.median(variance)), 0.0))
+    knots = [k for piece in pieces for k in _knots(piece)]
+    some = float(weight @ bias / weight.sum())
+    scale_known = bool(sd[0] < 0.5 * reckoning.PRIOR[0]) and "speed" in there
+    yaw_known = "yaw_rate" in there
+    return replace(
+        known,
+        offsets=offsets,
+        scale=float(mean[0]) if scale_known else 1.0,
+        scale_sd=float(sd[0] * max(1.0, spread[0])) if scale_known else float("inf"),
+        bias=some if yaw_known else 0.0,
+        bias_sd=float(weight.sum() ** -0.5) if yaw_known else float("inf"),
+        bias_at=tuple(knots) if yaw_known else (),
+        slip=float(np.median([piece.sigma[1] for piece in pieces])),
+        noise=dict(zip(reckoning.GROUPS, np.median([piece.sigma for piece in pieces], axis=0).tolist(), strict=True)),
+    )
+
+
+def _knots(piece: reckoning.Piece) -> list[tuple[float, float]]:
+    """Return times, about `KNOT` apart, and the mean bias around each."""
+    n = max(1, round(float(piece.t[-1] - piece.t[0]) / KNOT))
+    parts = np.array_split(np.arange(piece.t.size), min(n, piece.t.size))
+    return [(float(piece.t[part].mean()), float(piece.bias[part].mean())) for part in parts]
+
+
+def _together(pieces: Sequence[reckoning.Piece]) -> tuple[Floats, Floats, Floats]:
+    """Return mean, standard deviation and scatter over it, (5,) each, of independent pieces; strays count less."""
+    prior = np.diag(reckoning.PRIOR**-2.0)
+    centre = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+    weight = np.ones(len(pieces))
+    mean, own = centre, np.array([_marginal(piece) for piece in pieces])
+    for _ in range(10):
+        total = prior + sum(w * piece.information for w, piece in zip(weight, pieces, strict=True))
+        moment = prior @ centre + sum(
+            w * piece.information @ piece.mean for w, piece in zip(weight, pieces, strict=True)
+        )
+        mean = np.linalg.solve(total, moment)
+        far = np.array([np.abs(piece.mean - mean)[:3] for piece in pieces]) / own[:, :3]
+        weight = np.minimum(1.0, (4.0 / np.maximum(far.max(axis=1), 1e-9)) ** 2)
+    sd = np.sqrt(np.diag(np.linalg.inv(total)))
+    squares = np.array([(piece.mean - mean) ** 2 for piece in pieces]) / own**2
+    spread = np.sqrt(np.sum(weight[:, None] * squares, axis=0) / max(len(pieces) - 1, 1))
+    return mean, sd, spread
+
+
+def _marginal(piece: reckoning.Piece) -> Floats:
+    """Return the standard deviations (5,) of what a piece says by itself, with the prior."""
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(piece.information + np.diag(reckoning.PRIOR**-2.0)))))
+
+
+def _offset(pieces: Sequence[reckoning.Piece], k: int, mean: float, sd: float) -> Offset:
+    """Return an offset of one stream: the same for the drive, or stepping or drifting if the pieces say so."""
+    value = np.array([piece.mean[k] for piece in pieces])
+    own = np.array([_marginal(piece)[k] for piece in pieces])
+    sure = own < 0.5 * reckoning.PRIOR[k]
+    constant = Offset(mean, sd, bool(sd < OBSERVABLE))
+    if sure.sum() < 4:
+        return constant
+    t = np.array([piece.t.mean() for piece in pieces])[sure]
+    ends = np.array([(piece.t[0], piece.t[-1]) for piece in pieces])[sure]
+    value, own = value[sure], np.maximum(own[sure], 0.01)
+
+    def misfit(columns: Floats) -> tuple[float, Floats]:
+        found = np.linalg.lstsq(columns / own[:, None], value / own, rcond=None)[0]
+        return float(np.sum(np.minimum(((value - columns @ found) / own) ** 2, 25.0))), found
+
+    ones = np.ones(t.size)
+    flat, _ = misfit(ones[:, None])
+    line, slope = misfit(np.column_stack((ones, t - t.mean())))
+    cuts = range(1, t.size)
+    tried = [misfit(np.column_stack((np.arange(t.size) < c, np.arange(t.size) >= c)).astype(float)) for c in cuts]
+    cut = int(np.argmin([found[0] for found in tried])) + 1
+    step, levels = tried[cut - 1]
+    best = min(line, step)
+    noise = max(1.0, best / max(t.size - 2, 1))
+    if (flat - best) / noise < CHANGE_GAIN:
+        return constant
+    if step < line - noise and abs(levels[1] - levels[0]) > CHANGE_LEAST:
+        between = (ends[cut - 1, 1] + ends[cut, 0]) / 2
+        at = ((between - 1e-3, float(levels[0])), (between, float(levels[1])))
+        return Offset(mean, sd, True, at, "step")
+    if abs(slope[1]) * np.ptp(t) > CHANGE_LEAST:
+        first, last = ((float(x), float(slope[0] + slope[1] * (x - t.mean()))) for x in (ends[0, 0], ends[-1, 1]))
+        return Offset(float(slope[0]), sd, True, (first, last), "drift")
+    return constant
+
+
+def _antenna(
+    parts: Sequence[Grid],
+    streams: reckoning.Streams,
+    known: Calibration,
+    solved: Sequence[reckoning.Piece],
+    given: Offset,
+) -> Calibration | None:
+    """Let the antenna sit off the axle; return what that gives if the log tells where."""
+    clocks = [known.offsets[name].seconds if name in known.offsets else 0.0 for name in _SENSORS]
+    good = [(part, piece) for part, piece in zip(parts, solved, strict=True) if piece.sound]
+    slow = float(np.median([piece.sigma[3] for _, piece in good])) * np.sqrt(10.0)
+    if "yaw_rate" not in known.offsets or "speed" not in known.offsets or slow > ANTENNA_SLOW:
+        return None
+    found = [
+        reckoning.solve(
+            part,
+            streams,
+            _still(part, known),
+            (clocks[0], clocks[1]),
+            antenna=True,
+            fixed_clocks=given.given,
+            rounds=_MORE,
+            start=piece,
+        )
+        for part, piece in good
+    ]
+    found = [piece for piece in found if piece.sound]
+    if not found:
+        return None
+    mean, sd, spread = _together(found)
+    place, place_sd = mean[3:], (sd * np.maximum(spread, 1.0))[3:]
+    known = replace(known, antenna_sd=(float(place_sd[0]), float(place_sd[1])))
+    off = bool(np.hypot(*(place / place_sd)) > ANTENNA_SIGMAS and place_sd.max() < ANTENNA_SD)
+    if not off:
+        return known
+    path = np.concatenate([np.column_stack((piece.t, piece.azimuth)) for piece in found])
+    known = _joined(known, found, tuple(known.offsets), given)
+    return replace(known, antenna=(float(place[0]), float(place[1])), antenna_observable=True, path=_continuous(path))
+
+
+def _continuous(path: Floats) -> Floats:
+    """Put times in order and azimuths on one sheet."""
+    path = path[np.concatenate(([True], np.diff(path[:, 0]) > 0))]
+    return np.column_stack((path[:, 0], np.unwrap(path[:, 1])))
+
+
+# ---- the receiver's azimuth ----------------------------------------------------------------------------------------
+
+
+def _azimuth(log: Log, known: Calibration, pieces: Sequence[reckoning.Piece]) -> Calibration:
+    """Find the clock of the receiver's azimuth and what it adds, from the azimuth of the path."""
+    t, given = log.stream("azimuth_rad")
+    if t.size < FEWEST:
+        return known
+    blocks = []
+    for piece in pieces:
+        inside = (t > piece.t[0] + 3) & (t < piece.t[-1] - 3)
+        blocks += [np.flatnonzero(inside)[i : i + 200] for i in range(0, int(inside.sum()), 200)]
+    path = _continuous(np.concatenate([np.column_stack((piece.t, piece.azimuth)) for piece in pieces]))
+    rate = np.gradient(path[:, 1], path[:, 0])
+    offset, error, sd = 0.0, 0.0, float("inf")
+    v = np.interp(t, *known.stream(log, "speed")) if "speed" in known.offsets else np.full(t.size, 10.0)
+    for _ in range(5):
+        off = wrapped(given - np.interp(t + offset, path[:, 0], path[:, 1]))
+        turn = np.interp(t + offset, path[:, 0], rate)
+        counted = (np.abs(v) > 2.0) & (np.abs(off - error) < 0.5)
+        rows = [block[counted[block]] for block in blocks]
+        rows = [block for block in rows if block.size >= 5]
+        if sum(block.size for block in rows) < FEWEST:
+            return known
+        every = np.concatenate(rows)
+        scale = 3.0 * 1.4826 * float(np.median(np.abs(off[every] - np.median(off[every])))) + 1e-4
+        weight = np.minimum(1.0, scale / np.maximum(np.abs(off - error), 1e-9))
+        columns = np.column_stack((turn, np.ones(t.size)))
+        normal = np.einsum("n,ni,nj->ij", weight[every], columns[every], columns[every]) + 1e-9 * np.eye(2)
+        found = np.linalg.solve(normal, columns[every].T @ (weight * off)[every])
+        # neighbouring samples err alike: the scatter of sums over blocks counts, not that of samples
+        rest = weight * (off - columns @ found)
+        scores = np.array([columns[block].T @ rest[block] for block in rows])
+        inverse = np.linalg.inv(normal)
+        sd = float(np.sqrt((inverse @ (scores.T @ scores) @ inverse)[0, 0]))
+        offset = float(np.clip(offset + np.clip(found[0], -0.4, 0.4), -WIDEST, WIDEST))
+        error = float(found[1])
+    observable = bool(sd < OBSERVABLE and len(rows) >= 3)
+    offsets = {**known.offsets, "azimuth": Offset(offset, sd, observable)}
+    return replace(known, offsets=offsets, course_error=error)

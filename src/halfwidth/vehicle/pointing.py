@@ -1,0 +1,115 @@
+"""Where a drive points and how fast it goes before anything is solved: first guesses from fixes, courses and gyro."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.vehicle.grid import Grid
+
+Floats = NDArray[np.float64]
+
+
+def azimuth_of(drive: Grid) -> Floats:
+    """Return a first azimuth: the integrated yaw rate, turned to where fixes and courses point.
+
+    The turn is a smooth function of time, so that a yaw bias of a few hundredths of a rad/s is absorbed.
+
+    Parameters
+    ----------
+    drive : Grid
+
+    Returns
+    -------
+    (T,) array
+        Radians, clockwise from north, continuous.
+    """
+    if not drive.has_yaw_rate:
+        return _direction(drive)
+    t, h = drive.t, drive.h
+    turned = np.concatenate(([0.0], np.cumsum(-(drive.yaw_rate * h)[1:])))
+    seen = np.flatnonzero(drive.seen)
+    # displacements over about two seconds: short enough to be straight, long enough to stand out of the noise
+    stride = max(1, round(2.0 / max(float(np.median(np.diff(t[seen]))), 1e-3))) if seen.size > 1 else 1
+    a, b = seen[:-stride], seen[stride:]
+    near = t[b] - t[a] <= 2.0 * 2.0 + 1e-9
+    a, b = a[near], b[near]
+    moved = (drive.north[b] - drive.north[a]) + 1j * (drive.east[b] - drive.east[a])
+    weight = np.abs(moved) if not drive.has_speed else np.abs(drive.speed[b]) * (t[b] - t[a])
+    pointing = moved * weight * np.exp(-0.5j * (turned[a] + turned[b]))
+    when = 0.5 * (t[a] + t[b])
+    given = np.flatnonzero(np.isfinite(drive.course))
+    straight = (2.0 * np.maximum(np.abs(drive.speed[given]), 1.0)) ** 2 * np.exp(
+        1j * (drive.course[given] - turned[given])
+    )
+    when = np.concatenate((when, t[given]))
+    pointing = np.concatenate((pointing, straight))
+    if when.size == 0 or not np.any(pointing):
+        return turned
+    knots = np.linspace(t[0], t[-1], max(2, min(400, int((t[-1] - t[0]) / 5.0) + 2)))
+    near2 = ((knots[:, None] - when) / 15.0) ** 2
+    # far from all data the nearest one decides: the exponent is taken relative to the best of each knot
+    turn = np.exp(-0.5 * (near2 - near2.min(axis=1, keepdims=True))) @ pointing
+    first: Floats = turned + np.interp(t, knots, np.unwrap(np.angle(turn)))
+    return first
+
+
+def _secants(drive: Grid) -> tuple[Floats, Floats, NDArray[np.complex128]]:
+    """Return middle times, lengths in time and displacements (north + i east) between fixes about a second apart."""
+    seen = np.flatnonzero(drive.seen)
+    t = drive.t[seen]
+    if seen.size < 2:
+        return np.empty(0), np.empty(0), np.empty(0, dtype=complex)
+    stride = max(1, round(1.0 / max(float(np.median(np.diff(t))), 1e-3)))
+    stride = min(stride, seen.size - 1)
+    a, b = seen[:-stride], seen[stride:]
+    took = drive.t[b] - drive.t[a]
+    near = took <= max(3.0, 1.5 * float(np.median(took)))
+    a, b, took = a[near], b[near], took[near]
+    moved = (drive.north[b] - drive.north[a]) + 1j * (drive.east[b] - drive.east[a])
+    return 0.5 * (drive.t[a] + drive.t[b]), took, moved
+
+
+def _direction(drive: Grid) -> Floats:
+    """Return an azimuth without a yaw rate: the direction in which the fixes move, turning evenly between them."""
+    when, _, moved = _secants(drive)
+    far = np.abs(moved) > 0.5
+    if not far.any():
+        return np.zeros(len(drive))
+    turning: Floats = np.interp(drive.t, when[far], np.unwrap(np.angle(moved[far])))
+    return turning
+
+
+def with_speed(drive: Grid) -> Grid:
+    """Give a drive without a speed sensor the speed of its fixes, changing evenly where there are none.
+
+    Where no fix is near, the guess may be off by 0.7 m/s for each second to the next one, at most by 5 m/s.
+
+    Parameters
+    ----------
+    drive : Grid
+
+    Returns
+    -------
+    Grid
+        The same where it has a speed.
+    """
+    if drive.has_speed:
+        return drive
+    when, took, moved = _secants(drive)
+    if when.size == 0:
+        return replace(drive, speed_sd=np.full(len(drive), 5.0), has_speed=True)
+    h = drive.h
+    middle = drive.t - 0.5 * h
+    k = np.searchsorted(when, middle)
+    before, after = when[np.maximum(k - 1, 0)], when[np.minimum(k, when.size - 1)]
+    outside = (k == 0) | (k == when.size)
+    far = np.where(
+        outside, np.abs(middle - np.where(k == 0, after, before)), np.minimum(middle - before, after - middle)
+    )
+    pause = np.where(outside, 2 * far, after - before)
+    sd = np.minimum(0.7 * far, 5.0) * np.sqrt(np.maximum(pause / h, 1.0))
+    lost = pause > 1.5 * float(np.median(took))
+    return replace(
+        drive, speed=np.interp(middle, when, np.abs(moved) / took), speed_sd=np.where(lost, sd, 0.0), has_speed=True
+    )

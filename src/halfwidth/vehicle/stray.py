@@ -1,0 +1,358 @@
+"""Fixes that lie where the vehicle cannot have been: after a tunnel, before one, and wherever they jump.
+
+A receiver that finds its satellites again may be off by tens of metres for many seconds, and a path that believes it is
+bent all the way through the gap. Dead reckoning over a few seconds is far better than that. So wherever there is reason
+to doubt (the first seconds after a gap, the last ones before it, and what follows a jump that the sensors did not see)
+the doubtful fixes are hidden, and the chain, with the noise that the drive was found to have, says where they should
+have been: after a gap from the fixes after them alone, before it from those before them, so that a gap badly bridged
+proves nothing. What is further off than that can be wrong goes, up to the first fix that agrees again. If none agrees
+the fixes are believed: then the reckoning is wrong, or they are all that is known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.vehicle import chain
+from halfwidth.vehicle.grid import Grid
+from halfwidth.vehicle.pointing import azimuth_of
+from halfwidth.vehicle.sensors import Calibration
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: A pause between fixes from this length on may end with wrong ones, s.
+GAP = 3.0
+
+#: Fixes are doubted for so long after a gap or jump, and before a gap, s, where the length that speaks the clearest
+#: counts; and what is around them for so long, s.
+DOUBTED, AROUND = (2.0, 6.0, 12.0, 20.0), 40.0
+
+#: A fix is stray if it is this many standard deviations off where it should be, and this far, m. The fixes agree again
+#: once they are this many off, and must do so for this share of the time in doubt.
+FAR, FAR_M, NEAR, AGREED = 4.0, 0.5, 2.0, 0.15
+
+#: A jump is a step between fixes that differs from what the sensors say by this many usual differences and metres.
+JUMP, JUMP_M = 8.0, 1.0
+
+#: Doubts that are looked into at most, in one drive; how often, as what fades is seen bit by bit; rounds of the chain.
+_MOST, _LOOKS, _ROUNDS = 150, 4, 5
+
+#: Share of what is unusual that is enough for fixes that follow wrong ones: a fault that came fades.
+_AGAIN = 0.5
+
+#: Places where nobody doubts that show what is usual: about so many, and at least; the quantile of how far they are off
+#: that counts, and how many times that a stray fix is off; how many times `FAR` where there are too few such places.
+_CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 1.6, 2.0
+
+#: Scale of what the calibration takes to be without noise.
+_NO_NOISE = 1e-4
+
+#: Share of that distance that must be left when both sides of a gap are asked.
+_BOTH = 0.5
+
+#: Scale and bias are known to this many of their standard deviations, and no better than this.
+_KNOWN, _SCALE, _BIAS = 3.0, 0.003, 0.001
+
+#: Fixes that a doubt needs besides those it hides.
+_FEWEST = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Strays:
+    """Which nodes of a grid have a fix that is not to be used.
+
+    Parameters
+    ----------
+    at : (n,) int array
+        Nodes.
+    size : (n,) array
+        How far each fix is off, m.
+    """
+
+    at: NDArray[np.intp]
+    size: Floats
+
+    def masked(self, grid: Grid) -> Grid:
+        """Return the grid without these fixes."""
+        if not self.at.size:
+            return grid
+        hidden = np.zeros(len(grid), dtype=bool)
+        hidden[self.at] = True
+        return grid.masked(hidden)
+
+    def words(self, grid: Grid) -> str:
+        """Say which fixes go, when they were and how far they are off; empty if none goes."""
+        if not self.at.size:
+            return ""
+        run = np.concatenate(([0], np.cumsum(np.diff(self.at) > 1)))
+        spans = []
+        for k in range(int(run[-1]) + 1):
+            t, size = grid.t[self.at[run == k]], self.size[run == k]
+            when = f"{t[0]:.1f}" if t.size == 1 else f"{t[0]:.1f} to {t[-1]:.1f}"
+            spans.append(f"{when} s by up to {size.max():.1f} m")
+        more = f" and {len(spans) - 5} more" if len(spans) > 5 else ""
+        some = "1 fix lies" if self.at.size == 1 else f"{self.at.size} fixes lie"
+        return f"{some} where the vehicle cannot have been and {'is' if self.at.size == 1 else 'are'} left out: " + (
+            ", ".join(spans[:5]) + more
+        )
+
+
+_NONE = Strays(np.empty(0, dtype=np.intp), np.empty(0))
+
+
+def strays(grid: Grid, sensors: Calibration) -> Strays:
+    """Find fixes that dead reckoning from the fixes around them contradicts.
+
+    Parameters
+    ----------
+    grid : Grid
+        With the sensors put right.
+    sensors : Calibration
+        What is known of them.
+
+    Returns
+    -------
+    Strays
+        None where the drive has too few fixes, or no speed or yaw rate to reckon with.
+    """
+    if int(grid.seen.sum()) < 2 * _FEWEST or not (grid.has_speed and grid.has_yaw_rate and sensors.noise):
+        return _NONE
+    settings = chain.Chain(
+        rounds=_ROUNDS,
+        drifting=False,
+        tail=np.inf,
+        scale_sd=float(np.clip(_KNOWN * sensors.scale_sd, _SCALE, 0.03)),
+        bias_sd=float(np.clip(_KNOWN * sensors.bias_sd, _BIAS, 0.01)),
+    )
+    noise = np.array([sensors.noise.get(name, _NO_NOISE) for name in chain.GROUPS])
+    search = _Search(grid, np.flatnonzero(grid.seen), settings, noise)
+    gaps, jumps = _gaps(grid, search.seen), _jumps(grid, search.seen)
+    doubts = gaps[:_MOST]
+    for k in range(_LOOKS):
+        doubts = search.look(doubts, 1.0 if k == 0 else _AGAIN)
+    # what a stray stretch begins or ends with is a jump, too
+    near = np.convolve(search.gone[search.seen], np.ones(3), mode="same") > 0
+    search.look([doubt for doubt in jumps if not near[doubt.first]][:_MOST])
+    at = np.flatnonzero(search.gone)
+    return Strays(at, search.size[at]) if at.size <= 0.3 * search.seen.size else _NONE
+
+
+@dataclass(frozen=True)
+class _Doubt:
+    """Fixes that may be wrong, as numbers among those seen."""
+
+    first: int  # the first one, or the last one if they are doubted backwards
+    most: float  # at most so many seconds of them
+    block: tuple[int, int]  # fixes without a gap among them
+    before: bool  # whether the fixes before them are asked where they should have been
+    after: bool  # and those after them
+
+    @property
+    def backwards(self) -> bool:
+        """Whether the trouble ends a stretch of fixes instead of beginning one."""
+        return self.before and not self.after
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """What was said about one doubt at one length."""
+
+    doubt: _Doubt
+    length: float
+    nodes: NDArray[np.intp]  # of the doubtful fixes
+    off: list[tuple[Floats, Floats]]  # how far they are off, and the standard deviation of that, for each side asked
+
+
+@dataclass(frozen=True, eq=False)
+class _Wrong:
+    """Fixes that are wrong by what was said about one doubt."""
+
+    clear: float  # how many standard deviations the furthest is off
+    doubted: NDArray[np.intp]
+    nodes: NDArray[np.intp]
+    distance: Floats
+
+
+class _Search:
+    """One drive, and what was found in it so far."""
+
+    def __init__(self, grid: Grid, seen: NDArray[np.intp], settings: chain.Chain, noise: Floats) -> None:
+        self.grid, self.seen, self.settings, self.noise = grid, seen, settings, noise
+        self.size = np.zeros(len(grid))
+        self.gone = np.zeros(len(grid), dtype=bool)
+        self._usual: dict[tuple[bool, bool, float], float] = {}
+
+    def look(self, doubts: Sequence[_Doubt], share: float = 1.0) -> list[_Doubt]:
+        """Find which of the doubtful fixes are wrong; return the doubts that had some, moved on to the next fix.
+
+        A share of what is unusual is enough after fixes that were wrong.
+        """
+        clearest: dict[_Doubt, _Wrong] = {}
+        for answer in self._ask(doubts, DOUBTED):
+            doubt, nodes = answer.doubt, answer.nodes
+            if not _wrong(answer, share).any():
+                continue
+            wrong = _wrong(answer, share * self._unusual(doubt, answer.length)) & ~self.gone[nodes]
+            if wrong.any():
+                distance, sd = answer.off[-1]
+                clear = float((distance / sd)[wrong].max())
+                if doubt not in clearest or clear > clearest[doubt].clear:
+                    clearest[doubt] = _Wrong(clear, nodes, nodes[wrong], distance[wrong])
+        left = []
+        for doubt, stray in self._confirmed(clearest).items():
+            self.size[stray.nodes], self.gone[stray.nodes] = stray.distance, True
+            rest = np.flatnonzero(~self.gone[self.seen[doubt.block[0] : doubt.block[1]]]) + doubt.block[0]
+            rest = rest[rest <= doubt.first] if doubt.backwards else rest[rest >= doubt.first]
+            if rest.size:
+                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0])))
+        return left
+
+    def _ask(self, doubts: Sequence[_Doubt], lengths: Sequence[float]) -> list[_Answer]:
+        """Ask the fixes before, or after, or both, where the doubtful ones should have been."""
+        t, seen = self.grid.t[self.seen], self.seen
+        asked: list[tuple[_Doubt, float, NDArray[np.intp], list[slice]]] = []
+        hidden = []
+        for doubt in doubts:
+            for length in lengths:
+                lo, hi = np.searchsorted(t, t[doubt.first] + np.array([-length, length]) * (1 + 1e-9)).tolist()
+                lo = max(lo, doubt.block[0]) if doubt.backwards else doubt.first
+                hi = doubt.first + 1 if doubt.backwards else min(hi, doubt.block[1])
+                start = max(doubt.block[0], int(np.searchsorted(t, t[lo] - AROUND)))
+                stop = min(doubt.block[1], int(np.searchsorted(t, t[hi - 1] + AROUND)))
+                enough = lo - start >= _FEWEST or not doubt.before, stop - hi >= _FEWEST or not doubt.after
+                if length > doubt.most or not all(enough):
+                    break
+                sides = [(start, hi)] * doubt.before + [(lo, stop)] * doubt.after
+                parts = [slice(int(seen[a]), int(seen[b - 1]) + 1) for a, b in sides]
+                mask = self.gone.copy()
+                mask[seen[lo:hi]] = True
+                asked.append((doubt, length, seen[lo:hi], parts))
+                hidden += [self.grid.rows(part).masked(mask[part]) for part in parts]
+        if not hidden:
+            return []
+        fits = iter(chain.solve(hidden, self.settings, sigma=self.noise, learn=False))
+        return [
+            _Answer(doubt, length, nodes, [_off(self.grid, nodes, part, next(fits)) for part in parts])
+            for doubt, length, nodes, parts in asked
+        ]
+
+    def _confirmed(self, found: dict[_Doubt, "_Wrong"]) -> dict[_Doubt, "_Wrong"]:
+        """Ask the other side of the gap, too: what it puts right is not wrong."""
+        t, end = self.grid.t[self.seen], self.seen.size
+        hidden, parts = [], []
+        for doubt, wrong in found.items():
+            mask = self.gone.copy()
+            mask[wrong.doubted] = True
+            here = t[doubt.first]
+            back, ahead = (AROUND, AROUND + DOUBTED[-1]) if doubt.after else (AROUND + DOUBTED[-1], AROUND)
+            start = np.searchsorted(t, min(here, t[max(doubt.block[0] - 1, 0)]) - back)
+            stop = np.searchsorted(t, max(here, t[min(doubt.block[1], end - 1)] if not doubt.after else here) + ahead)
+            parts.append(slice(int(self.seen[start]), int(self.seen[min(int(stop), end - 1)]) + 1))
+            hidden.append(self.grid.rows(parts[-1]).masked(mask[parts[-1]]))
+        fits = chain.solve(hidden, self.settings, sigma=self.noise, learn=False) if hidden else []
+        kept = {}
+        for (doubt, wrong), part, fit in zip(found.items(), parts, fits, strict=True):
+            both, _ = _off(self.grid, wrong.nodes, part, fit)
+            if float(np.median(both)) > _BOTH * float(np.median(wrong.distance)):
+                kept[doubt] = wrong
+        return kept
+
+    def _unusual(self, doubt: _Doubt, length: float) -> float:
+        """Return how many times further off than `FAR` fixes must be that are doubted like this.
+
+        The chain's own deviations are too small on a log whose errors are not as it takes them. How far fixes are off
+        that nobody doubts, all along the drive, says by how much.
+        """
+        kind = doubt.before, doubt.after, length
+        if kind not in self._usual:
+            room = length + AROUND / 2
+            t = self.grid.t[self.seen]
+            controls = []
+            for a, b in _blocks(self.grid, self.seen):
+                times = np.arange(t[a] + room, t[b - 1] - room, max(length, (t[-1] - t[0]) / _CONTROLS))
+                firsts = np.searchsorted(t, times)
+                controls += [
+                    replace(doubt, first=int(k), most=np.inf, block=(a, b))
+                    for k in firsts
+                    if not self.gone[self.seen[k]]
+                ]
+            answers = self._ask(controls, (length,))
+            most = [float(np.min([distance / sd for distance, sd in one.off], axis=0).max()) for one in answers]
+            enough = len(most) >= _FEWEST_CONTROLS
+            usual = float(np.quantile(most, _QUANTILE)) if enough else _UNKNOWN * FAR
+            self._usual[kind] = max(1.0, _MARGIN * usual / FAR if enough else _UNKNOWN)
+        return self._usual[kind]
+
+
+def _off(grid: Grid, nodes: NDArray[np.intp], part: slice, fit: chain.Fit) -> tuple[Floats, Floats]:
+    """Return how far the fixes at some nodes are off a path, and the standard deviation of that, m."""
+    path, own = fit.path, nodes - part.start
+    if not path.finite or path.variance is None or not path.status.good:
+        return np.zeros(nodes.size), np.ones(nodes.size)
+    distance = np.hypot(path.east[own] - grid.east[nodes], path.north[own] - grid.north[nodes])
+    return distance, np.sqrt(path.variance[own].mean(axis=1) + path.fix_variance)
+
+
+def _gaps(grid: Grid, seen: NDArray[np.intp]) -> list[_Doubt]:
+    """Return the doubts about the first fixes after each gap and the last ones before it."""
+    found = []
+    blocks = _blocks(grid, seen)
+    for k, (a, b) in enumerate(blocks):
+        half = float(grid.t[seen[b - 1]] - grid.t[seen[a]]) / 2
+        if k > 0:
+            found.append(_Doubt(a, half, (a, b), before=False, after=True))
+        if k < len(blocks) - 1:
+            found.append(_Doubt(b - 1, min(half, DOUBTED[1]), (a, b), before=True, after=False))
+    return found
+
+
+def _blocks(grid: Grid, seen: NDArray[np.intp]) -> list[tuple[int, int]]:
+    """Return the stretches of fixes without a gap: the first one and the one after the last, among those seen."""
+    step = np.diff(grid.t[seen])
+    cut = np.flatnonzero(step > max(GAP, 3.0 * float(np.median(step)))) + 1
+    return list(pairwise([0, *cut.tolist(), seen.size]))
+
+
+def _jumps(grid: Grid, seen: NDArray[np.intp]) -> list[_Doubt]:
+    """Return the doubts about what follows a step between fixes that the sensors did not see."""
+    azimuth = azimuth_of(grid)
+    middle = 0.5 * (azimuth + np.concatenate((azimuth[:1], azimuth[:-1])))
+    way = grid.speed * grid.h
+    moved = np.column_stack((np.cumsum(way * np.sin(middle)), np.cumsum(way * np.cos(middle))))[seen]
+    fixes = np.column_stack((grid.east, grid.north))[seen]
+    odd = np.hypot(*(np.diff(fixes, axis=0) - np.diff(moved, axis=0)).T)
+    jumps = np.flatnonzero(odd > max(JUMP * float(np.median(odd)), JUMP_M)) + 1
+    found: list[_Doubt] = []
+    clear = -np.inf
+    for a, b in _blocks(grid, seen):
+        half = float(grid.t[seen[b - 1]] - grid.t[seen[a]]) / 2
+        for j in jumps[(jumps > a) & (jumps < b)].tolist():
+            if grid.t[seen[j]] > clear:
+                found.append(_Doubt(j, half, (a, b), before=True, after=True))
+                clear = grid.t[seen[j]] + 1.0
+    return found
+
+
+def _wrong(answer: _Answer, times: float) -> Mask:
+    """Return which of the doubted fixes are wrong: from the first on, up to where they agree again.
+
+    They are wrong if all that were asked say so, by so many times the usual; the last one asked says where they agree.
+    """
+    far = np.all([(distance > times * FAR * sd) & (distance > FAR_M) for distance, sd in answer.off], axis=0)
+    distance, sd = answer.off[-1]
+    near = distance < np.maximum(times * NEAR * sd, FAR_M)
+    if answer.doubt.backwards:
+        far, near = far[::-1], near[::-1]
+    wrong = np.zeros(far.size, dtype=bool)
+    if far.any():
+        again = int(np.flatnonzero(far)[-1]) + 1
+        again += int(np.argmax(near[again:])) if near[again:].any() else far.size
+        agreed = near[again:]
+        # where they do not agree again for a while, or most before that do, it is no fault that came and went
+        if agreed.size >= max(1, AGREED * far.size) and agreed.mean() > 0.8 and (~near[:again]).mean() > 0.5:
+            wrong[:again] = ~near[:again] | far[:again]
+    return wrong[::-1] if answer.doubt.backwards else wrong

@@ -1,0 +1,162 @@
+"""Faults that logs have: each is found and named, or survived, and the gaps are filled as well as without it.
+
+A drive with known truth and two tunnels is spoiled in one way at a time; `fill` gets it as it is.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from halfwidth.vehicle import check, fill, simulate_drive
+from halfwidth.vehicle.align import calibrated
+from halfwidth.vehicle.check_sensors import items
+from halfwidth.vehicle.formats import read
+from halfwidth.vehicle.grid import sampled
+from halfwidth.vehicle.stray import strays
+
+GAPS = ((100.0, 125.0), (220.0, 235.0))
+DRIVE = {"duration": 330.0, "outages": GAPS, "fix_noise": 0.1, "fix_offset": 0.1}
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return simulate_drive(seed=4, **DRIVE)
+
+
+@pytest.fixture(scope="module")
+def clean(drive):
+    truth, log = drive
+    return in_gaps(truth, fill(log))
+
+
+def in_gaps(truth, track, spans=GAPS, late=0.0):
+    """Return the largest distance to the truth in the gaps, m."""
+    worst = 0.0
+    for first, last in spans:
+        inside = (track.t_s >= first) & (track.t_s <= last)
+        assert inside.any()
+        off = truth.error_m(track.t_s[inside] - late, track.lat_deg[inside], track.lon_deg[inside])
+        worst = max(worst, float(np.hypot(*off).max()))
+    return worst
+
+
+def shifted(log, rows, east):
+    lon = log.lon_deg.copy()
+    lon[rows] += east / (111_320 * np.cos(np.radians(50.09)))
+    return replace(log, lon_deg=lon)
+
+
+def after(log, t, seconds):
+    return np.flatnonzero(log.fixed & (log.t > t) & (log.t <= t + seconds))
+
+
+def said(track, words):
+    return any(words in message for message in track.messages)
+
+
+def test_without_a_fault_nothing_is_left_out(drive, clean):
+    _, log = drive
+    assert clean < 1.5
+    known = calibrated(log)
+    assert strays(sampled(log, sensors=known), known).at.size == 0
+
+
+def test_a_frozen_receiver_is_named_and_bridged(drive, clean):
+    truth, log = drive
+    rows = after(log, 160, 8)
+    lat, lon = log.lat_deg.copy(), log.lon_deg.copy()
+    lat[rows], lon[rows] = lat[rows[0]], lon[rows[0]]
+    track = fill(replace(log, lat_deg=lat, lon_deg=lon))
+    assert said(track, "repeat the fix before while the car moved")
+    assert in_gaps(truth, track, ((160.5, 167.5), *GAPS)) < 2 * clean + 0.5
+
+
+@pytest.mark.parametrize(("seconds", "east"), [(0.1, 40.0), (4.0, 15.0)])
+def test_a_jump_is_named_and_left_out(drive, clean, seconds, east):
+    truth, log = drive
+    track = fill(shifted(log, after(log, 170, seconds), east))
+    assert said(track, "where the vehicle cannot have been") or said(track, "far from where")
+    assert in_gaps(truth, track) < 2 * clean + 0.5
+
+
+@pytest.mark.parametrize(("seconds", "east"), [(0.1, 10.0), (0.1, 100.0), (3.0, 20.0)])
+def test_wrong_first_fixes_after_a_gap_do_not_bend_it(drive, clean, seconds, east):
+    truth, log = drive
+    wrong = shifted(log, np.concatenate([after(log, last, seconds) for _, last in GAPS]), east)
+    track = fill(wrong)
+    assert said(track, "where the vehicle cannot have been")
+    assert in_gaps(truth, track) < 2 * clean + 0.5
+    known = calibrated(wrong)
+    grid = sampled(wrong, sensors=known)
+    found = strays(grid, known)
+    times = grid.t[found.at]
+    for _, last in GAPS:
+        near = (times > last) & (times < last + seconds + 1)
+        assert near.any()
+        assert found.size[near].max() == pytest.approx(east, rel=0.2)  # named with its size
+    (item,) = (one for one in items(wrong, known) if one.name == "stray fixes")
+    assert item.verdict == "warn"
+    assert item.evidence["off_m"]
+
+
+def test_multipath_that_fades_bends_a_gap_less_than_it_could(clean):
+    truth, log = simulate_drive(seed=4, multipath=30.0, multipath_time=2.0, **DRIVE)
+    track = fill(log)
+    assert said(track, "where the vehicle cannot have been")
+    assert in_gaps(truth, track) < 6
+    assert in_gaps(truth, fill(log, distrust=False)) > 15
+
+
+def test_a_clock_that_jumps_for_all_streams_is_survived(drive, clean):
+    truth, log = drive
+    moved = replace(log, t=np.where(log.t > 170, log.t + 2.0, log.t))
+    track = fill(moved)
+    assert in_gaps(truth, track, GAPS[:1]) < 2 * clean + 0.5
+    assert in_gaps(truth, track, ((222.0, 237.0),), late=2.0) < 2 * clean + 0.5
+
+
+def test_fixes_that_come_late_are_put_in_time(clean):
+    truth, log = simulate_drive(seed=4, clock_offset=0.3, **DRIVE)
+    track = fill(log)
+    assert said(track, "clocks against the fixes: speed +0.3")
+    assert in_gaps(truth, track, late=0.3) < 2 * clean + 0.5
+
+
+@pytest.mark.parametrize(
+    ("field", "factor", "words"),
+    [
+        ("yaw_rate_radps", -1.0, "positive to the right"),
+        ("yaw_rate_radps", 180 / np.pi, "in deg/s"),
+        ("speed_mps", 3.6, "speed is in km/h"),
+    ],
+)
+def test_a_wrong_sign_or_unit_is_named_and_put_right(drive, clean, field, factor, words):
+    truth, log = drive
+    wrong = replace(log, **{field: factor * getattr(log, field)})
+    track = fill(wrong)
+    assert said(track, words)
+    assert in_gaps(truth, track) < 2 * clean + 0.5
+    item = check(wrong)["speed" if field == "speed_mps" else "yaw rate"]
+    assert item.verdict == "bad"
+    assert item.line
+
+
+def test_without_a_speed_a_gap_is_still_bridged(drive):
+    truth, log = drive
+    track = fill(replace(log, speed_mps=np.full(len(log), np.nan)))
+    assert said(track, "no speed")
+    assert np.isfinite(track.lat_deg).all()
+    assert in_gaps(truth, track) < 120  # no further than the car could go
+
+
+def test_everything_at_one_hertz(data):
+    log = read(data / "driveplotr_nds_drive18.csv.gz")
+    hidden = log.without(500, 530)
+    track = fill(hidden)
+    inside = (track.t_s > 500) & (track.t_s < 530)
+    real = np.isin(log.t, track.t_s[inside])
+    north = (track.lat_deg[inside] - log.lat_deg[real]) * 111_000
+    east = (track.lon_deg[inside] - log.lon_deg[real]) * 111_320 * np.cos(np.radians(41.26))
+    assert np.hypot(east, north).max() < 10
+    assert said(track, "clocks against the fixes: speed -0.")
