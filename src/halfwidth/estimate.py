@@ -19,9 +19,9 @@ DEFAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("Hull", {}),
     ("UnscentedKalman", {"smooth": True}),
     ("GPB", {"depth": 5, "smooth": True}),
+    ("MixedFilter", {}),
     ("Posterior", {}),
     ("BatchLP", {}),
-    ("MixedFilter", {}),
     ("ParticleFilter", {}),
 )
 
