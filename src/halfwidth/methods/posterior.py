@@ -201,8 +201,13 @@ class Posterior:
             return with_entries(self, model, record)
         return self.answer(model, record).estimate
 
-    def answer(self, model: Linear, record: Record, *, start: "Start | None" = None) -> "Answer":
-        """Return the estimate of a model without unknown entries, and what the next one may start from."""
+    def answer(self, model: Linear, record: Record, *, start: "Start | Array | None" = None) -> "Answer":
+        """Return the estimate of a model without unknown entries, and what the next one may start from.
+
+        `start` holds half-widths (p,), with the sites that belong to them if the chain has the same shape.
+        """
+        if isinstance(start, np.ndarray):
+            start = Start(start, None)
         problem = sites(model, record, outliers=self.outliers is not False and self.outliers != 0)
         if start is None and len(record) > 2 * _FIRST and problem.free.any():
             # The first rows alone say where to look.
