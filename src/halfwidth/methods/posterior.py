@@ -23,7 +23,7 @@ Perturbative corrections for approximate inference in Gaussian latent variable m
 import functools
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -37,11 +37,11 @@ from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.spread import Box, Normal, Shaped
+from halfwidth.spread import Box, Cloud, Normal, Shaped
 
 _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
-POWER = 0.6
+POWER = 0.85
 #: Nodes are Gaussian in this power of a half-width: there a half-width that may be 0 has no tail.
 _WARP = 0.5
 _LIMITS = {
@@ -72,6 +72,9 @@ class Posterior:
 
     Parameters
     ----------
+    method : {"ep", "sample"}
+        Expectation propagation, or draws by Markov chains: slow, and the truth that the first is held against. Draws
+        take linear models of uniform or Gaussian noise; ``info["rhat"]`` says whether the chains agree.
     nodes : int
         Points over which unknown half-widths are integrated; 1 takes their mode as if it were the truth.
     outliers : float or bool
@@ -79,7 +82,7 @@ class Posterior:
         a bounded part.
     rounds : int
         Most linearisations of a nonlinear model.
-    sweeps : int
+    iterations : int
         Most sweeps of one evaluation with everything known.
 
     Notes
@@ -106,17 +109,20 @@ class Posterior:
     True
     """
 
+    method: Literal["ep", "sample"] = "ep"
     nodes: int = 64
     outliers: float | bool = False
     rounds: int = 20
-    sweeps: int = 200
+    iterations: int = 200
 
     def __post_init__(self) -> None:
+        if self.method not in ("ep", "sample"):
+            raise BadValue(f"`method` is {self.method!r}, 'ep' or 'sample' was expected")
         if not isinstance(self.nodes, int | np.integer) or self.nodes < 1:
             raise BadValue(f"`nodes` is {self.nodes!r}, a positive whole number was expected")
         if not isinstance(self.outliers, bool) and not 0 <= self.outliers < 1:
             raise BadValue(f"`outliers` is {self.outliers!r}, a share from 0 below 1, or True, was expected")
-        for name in ("rounds", "sweeps"):
+        for name in ("rounds", "iterations"):
             if not isinstance(getattr(self, name), int | np.integer) or getattr(self, name) < 1:
                 raise BadValue(f"`{name}` is {getattr(self, name)!r}, a positive whole number was expected")
 
@@ -126,10 +132,22 @@ class Posterior:
         return None if reason is None else f"`Posterior` {reason}\nhint: {hint}"
 
     def _reason(self, model: Model) -> tuple[str | None, str]:
+        if self.method == "sample":
+            from halfwidth.methods._sample import refuses
+
+            reason = refuses(model)
+            if self.outliers:
+                reason = "the sampler knows no outliers\nhint: method='ep'"
+            why, _, hint = (reason or "").partition("\nhint: ")
+            return (f"cannot draw: {why}", hint) if reason else (None, "")
         if model.nx > _MOST_STATES:
             return f"takes at most {_MOST_STATES} states but the model has {model.nx}", "a smaller model"
         if isinstance(model, Nonlinear) and model.loss is not None:
             return "takes no loss of a nonlinear model", "RBPF() or ParticleFilter()"
+        if model.bounds is not None:
+            _, lo, hi = model.bounds.rows
+            if np.any(lo == hi):
+                return "has no equalities among `bounds`", "Constrained(KalmanSmoother()), or a model with fewer states"
         part = gaussian_part(model.e)
         if part is not None and uniform_part(model.e) is not None and not _diagonal(part):
             return "needs independent outputs where noise is mixed but `e` has a full covariance", "variances (ny,)"
@@ -164,8 +182,11 @@ class Posterior:
             return "needs independent outputs where they may be lost but `e` has a full covariance", "RBPF()"
         return None, ""
 
-    def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
-        """Estimate the states of one record."""
+    def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:
+        """Estimate the states of one record; `seed` is for draws."""
+        if self.method == "sample":
+            assert isinstance(model, Linear)
+            return self._drawn(model, record, seed)
         if isinstance(model, Nonlinear):
             from halfwidth.methods._relinearise import relinearised
 
@@ -198,6 +219,46 @@ class Posterior:
         found = self._solve(problem, model, start)
         return Answer(self._estimate(problem, found, model, record), problem, found)
 
+    def _drawn(self, model: Linear, record: Record, seed: int | None) -> Estimate:
+        """Return the posterior as a cloud of draws."""
+        from halfwidth.methods._sample import improper, sample
+
+        nx = model.nx
+        why = improper(model, record, None)
+        draws = None if why else sample(model, record, seed=seed)
+        if draws is None:
+            est = replace(self, method="ep").run(model, record)
+            said = (
+                {} if why is None else {"message": why.partition("\nhint: ")[0], "hint": why.partition("\nhint: ")[2]}
+            )
+            return replace(est, status=Status.INFEASIBLE, method=typed(self), loglik=None, info=dict(est.info) | said)
+        points = np.ascontiguousarray(np.moveaxis(draws.x.reshape(-1, *draws.x.shape[2:]), 0, 1))
+        s = draws.s.reshape(-1, draws.s.shape[-1])
+        x, mean = points.mean(axis=1), s.mean(axis=0)
+        status = Status.OK if draws.rhat <= 1.01 else Status.REDUCED if draws.rhat <= 1.1 else Status.STALLED
+        info = {
+            "x0": x[0],
+            "half_widths": {
+                "mean": mean, "sd": s.std(axis=0),
+                "lo": np.quantile(s, 0.05, axis=0), "hi": np.quantile(s, 0.95, axis=0),
+            },
+            "rhat": draws.rhat, "ess": draws.ess, "seed": seed, "notes": [],
+        }  # fmt: skip
+        weights = np.full((len(record), points.shape[1]), 1.0 / points.shape[1])
+        return Estimate(
+            record.t,
+            x[1:].copy(),
+            Cloud(points[1:], weights),
+            status,
+            typed(self),
+            q=mean[:nx].copy() if uniform_part(model.w) is not None else None,
+            r=mean[nx:].copy() if uniform_part(model.e) is not None else None,
+            theta=draws.theta.reshape(-1, draws.theta.shape[-1]).mean(axis=0) if draws.theta.shape[-1] else None,
+            names=model.names.x,
+            labels=record.labels,
+            info=info,
+        )
+
     def _solve(self, chain: Sites, model: Linear, start: "Start | None") -> dict[str, Any]:
         rate, learn_rate, beta = self._rate(model)
         first = np.where(chain.uniform, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), 0.0)
@@ -215,7 +276,7 @@ class Posterior:
         if rows > _LONG:
             limits |= _OF_LONG
         if q == 0:
-            limits |= _KNOWN | {"most": self.sweeps}
+            limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
             limits |= _MIXED
         if chain.exact:
