@@ -1,6 +1,7 @@
 """Taking data away never makes a Gaussian answer or a guaranteed box narrower.
 
-A belief cut at bounds is left out: the further outside its mean is, the less of it is left.
+A belief cut at bounds is left out: the further outside its mean is, the less of it is left. So is the posterior of
+bounded noise: an output at the edge of what is possible narrows it less than one in the middle.
 """
 
 import numpy as np
@@ -17,6 +18,7 @@ SPREAD = [
     and not weighs(m)
     and not point_only(m)
     and c.model.bounds is None
+    and (type(m).__name__ != "Posterior" or all(isinstance(v, hw.Gaussian) for v in (c.model.w, c.model.e)))
     and c.model.w.known
     and c.model.e.known
     # the gain of these makes a set small, not its box: with fewer outputs another coordinate may gain

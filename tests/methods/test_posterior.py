@@ -43,14 +43,13 @@ def test_gaussian_noise_is_the_smoother(missing):
     assert isinstance(one.spread, hw.Normal)
 
 
-def test_known_half_widths_agree_with_a_sampler():
-    from halfwidth.methods._sample import sample
-
+def test_known_half_widths_agree_with_draws():
     truth, record = drawn(12, 2)
     model = paper(hw.Uniform(0.1), hw.Uniform(0.3), bounds=BOX)
     est = hw.estimate(model, record, hw.Posterior())
-    draws = sample(model, record, draws=1500, chains=2, seed=1)
-    x = draws.x[:, :, 1:].reshape(-1, *est.x.shape)
+    drawn_est = hw.estimate(model, record, hw.Posterior(method="sample"), seed=1)
+    assert drawn_est.status is hw.Status.OK
+    x = np.moveaxis(drawn_est.spread.points, 1, 0)
     sd = x.std(axis=0)
     assert np.abs((est.x - x.mean(axis=0)) / sd).mean() < 0.05
     assert np.abs(est.spread.sd / sd - 1).max() < 0.12
@@ -232,7 +231,9 @@ def test_evidence_and_left_out_score_choose_the_noise():
 
 
 @pytest.mark.parametrize(
-    "settings", [{"nodes": 0}, {"outliers": -0.1}, {"outliers": 1.0}, {"rounds": 0}, {"sweeps": 0}], ids=str
+    "settings",
+    [{"nodes": 0}, {"outliers": -0.1}, {"outliers": 1.0}, {"rounds": 0}, {"iterations": 0}, {"method": "gibbs"}],
+    ids=str,
 )
 def test_bad_settings(settings):
     with pytest.raises(hw.BadValue):

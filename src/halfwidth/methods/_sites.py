@@ -76,7 +76,7 @@ def sites(model: Linear, record: Record, *, outliers: bool = False) -> Sites:
     w_group = np.where(uniform[:nx] & (cap[:nx] > 0), np.arange(nx), -1)
     problem["group_w"] = w_group.astype(np.int32)
     rows = _outputs(model, record, dt, scale, outliers)
-    rows += _bounds(model, T, scale)
+    rows += _bounds(model, T)
     rows += _first_bounds(model)
     stage = np.concatenate([r.stage for r in rows]) if rows else np.zeros(0, dtype=np.intp)
     order = np.argsort(stage, kind="stable")
@@ -311,7 +311,7 @@ def _lost(model: Linear, record: Record, dt: Array, t: NDArray[np.intp], j: NDAr
     return found
 
 
-def _bounds(model: Linear, T: int, scale: Array) -> list[_Rows]:
+def _bounds(model: Linear, T: int) -> list[_Rows]:
     if model.bounds is None:
         return []
     D, lo, hi = model.bounds.rows
@@ -321,12 +321,7 @@ def _bounds(model: Linear, T: int, scale: Array) -> list[_Rows]:
     found = []
     for d, a, b in zip(D, lo, hi, strict=True):
         stage, h = np.arange(1, T + 1), np.broadcast_to(d, (T, model.nx))
-        if a == b:  # an equality is an output without noise
-            unit = float(np.abs(d) @ scale[: model.nx])
-            R = np.full(T, _EXACT * max(unit, 1e-12 * abs(a), 1e-150) ** 2)
-            found.append(_Rows.of(p, stage, h, GAUSSIAN, y=np.full(T, a), R=R))
-        else:
-            found.append(_Rows.of(p, stage, h, TRUNCATION, lo=np.full(T, a), hi=np.full(T, b)))
+        found.append(_Rows.of(p, stage, h, TRUNCATION, lo=np.full(T, a), hi=np.full(T, b)))
     return found
 
 

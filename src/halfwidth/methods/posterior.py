@@ -41,7 +41,7 @@ from halfwidth.spread import Box, Normal, Shaped
 
 _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
-POWER = 0.6
+POWER = 0.85
 #: Nodes are Gaussian in this power of a half-width: there a half-width that may be 0 has no tail.
 _WARP = 0.5
 _LIMITS = {
@@ -72,6 +72,10 @@ class Posterior:
 
     Parameters
     ----------
+    method : {"ep", "sample"}
+        Expectation propagation, or draws by Markov chains: slow, and the truth that the first is held against. Draws
+        take linear models of uniform or Gaussian noise; ``info["rhat"]`` says whether the chains agree. Their prior of a
+        half-width is the power alone, without `told`.
     nodes : int
         Points over which unknown half-widths are integrated; 1 takes their mode as if it were the truth.
     outliers : float or bool
@@ -79,11 +83,8 @@ class Posterior:
         a bounded part.
     rounds : int
         Most linearisations of a nonlinear model.
-    sweeps : int
+    iterations : int
         Most sweeps of one evaluation with everything known.
-    method : {"ep", "sample"}
-        "sample" draws Markov chains instead: exact in the limit, far slower, for linear models with uniform or
-        Gaussian noise. Its prior of a half-width is the power alone, without `told`.
     draws, chains : int
         Draws kept of each chain, and chains, of "sample".
 
@@ -115,41 +116,47 @@ class Posterior:
     True
     """
 
+    method: Literal["ep", "sample"] = "ep"
     nodes: int = 64
     outliers: float | bool = False
     rounds: int = 20
-    sweeps: int = 200
-    method: Literal["ep", "sample"] = "ep"
+    iterations: int = 200
     draws: int = 1000
     chains: int = 4
 
     def __post_init__(self) -> None:
+        if self.method not in ("ep", "sample"):
+            raise BadValue(f"`method` is {self.method!r}, 'ep' or 'sample' was expected")
         if not isinstance(self.nodes, int | np.integer) or self.nodes < 1:
             raise BadValue(f"`nodes` is {self.nodes!r}, a positive whole number was expected")
         if not isinstance(self.outliers, bool) and not 0 <= self.outliers < 1:
             raise BadValue(f"`outliers` is {self.outliers!r}, a share from 0 below 1, or True, was expected")
-        for name, least in (("rounds", 1), ("sweeps", 1), ("draws", 8), ("chains", 1)):
+        for name, least in (("rounds", 1), ("iterations", 1), ("draws", 8), ("chains", 1)):
             if not isinstance(getattr(self, name), int | np.integer) or getattr(self, name) < least:
                 raise BadValue(f"`{name}` is {getattr(self, name)!r}, a whole number from {least} was expected")
-        if self.method not in ("ep", "sample"):
-            raise BadValue(f"`method` is {self.method!r}, 'ep' or 'sample' was expected")
 
     def refuses(self, model: Model) -> str | None:
         """Return why the model is none of this method, with a hint, or None."""
-        if self.method == "sample":
-            from halfwidth.methods import _sample
-
-            if self.outliers:
-                return "`Posterior(method='sample')` finds no outliers\nhint: method='ep'"
-            return _sample.refuses(model)
         reason, hint = self._reason(model)
         return None if reason is None else f"`Posterior` {reason}\nhint: {hint}"
 
     def _reason(self, model: Model) -> tuple[str | None, str]:
+        if self.method == "sample":
+            from halfwidth.methods._sample import refuses
+
+            reason = refuses(model)
+            if self.outliers:
+                reason = "the sampler knows no outliers\nhint: method='ep'"
+            why, _, hint = (reason or "").partition("\nhint: ")
+            return (f"cannot draw: {why}", hint) if reason else (None, "")
         if model.nx > _MOST_STATES:
             return f"takes at most {_MOST_STATES} states but the model has {model.nx}", "a smaller model"
         if isinstance(model, Nonlinear) and model.loss is not None:
             return "takes no loss of a nonlinear model", "RBPF() or ParticleFilter()"
+        if model.bounds is not None:
+            _, lo, hi = model.bounds.rows
+            if np.any(lo == hi):
+                return "has no equalities among `bounds`", "Constrained(KalmanSmoother()), or a model with fewer states"
         part = gaussian_part(model.e)
         if part is not None and uniform_part(model.e) is not None and not _diagonal(part):
             return "needs independent outputs where noise is mixed but `e` has a full covariance", "variances (ny,)"
@@ -240,7 +247,7 @@ class Posterior:
         if rows > _LONG:
             limits |= _OF_LONG
         if q == 0:
-            limits |= _KNOWN | {"most": self.sweeps}
+            limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
             limits |= _MIXED
         if chain.exact:
