@@ -74,8 +74,8 @@ class Posterior:
     ----------
     method : {"ep", "sample"}
         Expectation propagation, or draws by Markov chains: slow, and the truth that the first is held against. Draws
-        take linear models of uniform or Gaussian noise; ``info["rhat"]`` says whether the chains agree. Their prior of a
-        half-width is the power alone, without `told`.
+        take linear models of uniform or Gaussian noise; ``info["rhat"]`` says whether the chains agree. Their prior of
+        a half-width is the power alone, without `told`.
     nodes : int
         Points over which unknown half-widths are integrated; 1 takes their mode as if it were the truth.
     outliers : float or bool
