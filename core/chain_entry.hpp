@@ -17,7 +17,7 @@ struct ChainArgs {
     double* z;  // (q)   right-hand side -> solution
     double* x;  // (T,n) solution
     double *S, *C, *H;  // (T,n,n), (T,n,n), (T,n,q): inverse at (t,t), (t,t-1), (t,border); null: not wanted
-    double drop;        // pivots below this share of their diagonal entry are held there
+    double drop;        // directions whose pivot is below this share of its diagonal entry are left out
     double* work;       // chain_workspace doubles
 };
 

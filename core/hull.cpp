@@ -40,10 +40,20 @@ std::ptrdiff_t hull_run(HullTask& task, const HullSettings& set, void* workspace
         const std::ptrdiff_t bad = box_contract(box);
         if (bad) return bad;
     }
+    bool bounded = true;
+    for (std::ptrdiff_t i = 0; i < std::ptrdiff_t(win.K + 1) * win.n; i++) bounded = bounded && finite(task.lo[i]) && finite(task.hi[i]);
+    const std::ptrdiff_t stride = std::ptrdiff_t(win.K) * (win.n + win.m);
+    if (!bounded && !task.given) {  // any rounding of an unbounded state is infinite: the caller bounds it first
+        for (int p = 0; p < task.costs; p++) {
+            task.bound[p] = task.gap[p] = inf;
+            task.value[p] = -inf;
+            for (std::ptrdiff_t i = 0; i < stride; i++) task.y[p * stride + i] = 0.0;
+        }
+        return 0;
+    }
     hull_rows_of(win, space.rows, space.extra);
     if (!task.given)
         task.iterations = hull_solve(space.rows, set, task.costs, task.c, task.k, task.y, task.value, task.gap, space.solver);
-    const std::ptrdiff_t stride = std::ptrdiff_t(win.K) * (win.n + win.m);
     for (int p = 0; p < task.costs; p++)
         task.bound[p] = hull_sup(space.rows, task.c + std::ptrdiff_t(p) * win.n, task.k[p], task.y + p * stride, space.d);
     return 0;

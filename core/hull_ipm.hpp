@@ -293,6 +293,7 @@ struct HullIpm {
         V moving = V(1.0), low = V(inf), high = V(-inf);
         for (I at = 0; at < I(K + 1) * G; at++) best[at] = V(0.0);
         int iter = 0, since[P] = {0};
+        double least[P] = {inf, inf, inf, inf};  // complementarity so far
         V mu_sum = V(0.0);
         for (; iter < set.max_iter; iter++) {
             // rows: weights, residuals, complementarity, and the bound that these multipliers give
@@ -343,7 +344,9 @@ struct HullIpm {
                     low.set(p, bound[p]);
                 }
                 if (pres[p] <= 1e-8 && value_now[p] > high[p]) high.set(p, value_now[p]);
-                since[p] = low[p] - high[p] < 0.9 * gap_was || !finite(gap_was) ? 0 : since[p] + 1;
+                const bool gains = low[p] - high[p] < 0.9 * gap_was || !finite(gap_was) || mu_sum[p] < 0.9 * least[p];
+                since[p] = gains ? 0 : since[p] + 1;
+                least[p] = min2(least[p], mu_sum[p]);
                 if (low[p] - high[p] <= set.tol || since[p] > hull_patience || !finite(bound[p])) moving.set(p, 0.0);
                 done = done && moving[p] == 0.0;
             }

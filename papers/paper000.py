@@ -3,13 +3,17 @@
 Run ``python papers/paper000.py [--quick]``; ``halfwidth reproduce 000`` prints the same tables.
 """
 
+import pathlib
 import sys
 
 from halfwidth import reproduce
 
+#: Logs of drives, where a folder with some stands beside the repository.
+LOGS = sorted(str(path) for path in (pathlib.Path(__file__).parents[2] / "shared" / "data").glob("*.csv.gz"))
+
 
 def main(quick=False):
-    for table in reproduce.tables("000", quick=quick):
+    for table in reproduce.tables("000", quick=quick, logs=LOGS):
         print(table.text(), end="\n\n")
     for file in reproduce.paper("000").figures("out/papers", quick=quick):
         print(file)

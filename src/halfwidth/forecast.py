@@ -15,7 +15,7 @@ from halfwidth.methods.kalman import matrices
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate
-from halfwidth.spread import Both, Box, Cloud, Normal, Spread
+from halfwidth.spread import part
 
 
 def forecast(
@@ -81,7 +81,7 @@ def forecast(
     return Estimate(
         est.t[s],
         est.x[s],
-        _part(est.spread, s),
+        part(est.spread, s),
         est.status,
         est.method,
         q=est.q,
@@ -98,15 +98,3 @@ def _tail(stack: Array, which: Any, s: slice) -> Array:
     if which is not None:
         return np.asarray(stack[which[s]])
     return np.asarray(stack[0] if len(stack) == 1 else stack[s])
-
-
-def _part(spread: Spread | None, s: slice) -> Spread | None:
-    if isinstance(spread, Normal):
-        return Normal.of(spread.mean[s], spread.P[s])
-    if isinstance(spread, Both):
-        return Both(spread.mean[s], spread.P[s], spread.half[s])
-    if isinstance(spread, Box):
-        return Box(spread.lo[s], spread.hi[s], guaranteed=spread.guaranteed)
-    if isinstance(spread, Cloud):
-        return Cloud(spread.points[s], spread.weights[s])
-    return None

@@ -332,13 +332,16 @@ class Nonlinear:
         given = (np.zeros(self.nu) if u is None else real(u, "u")) if self.nu else None
         if given is not None and given.shape != (self.nu,):
             raise BadShape(f"`u` has shape {given.shape}, ({self.nu},) was expected from the model")
-        rest: tuple[Any, ...] = (given, self.dt if dt is None else float(dt))
-        rows: list[Array] = []
-        for name, size, angles in (("g", self.nx, self.x_angles), ("h", self.ny, self.y_angles)):
-            f = getattr(self, name)
-            more = rest[: arity(f, 3 if name == "g" else 1) - 1]
-            rows += self._linearised(name, f, point, more, size, angles, by)
+        step = self.dt if dt is None else float(dt)
+        rows = [*self.slope("g", point, given, step, by), *self.slope("h", point, given, step, by)]
         return Linearised(*rows)
+
+    def slope(self, name: str, x: Array, u: Array | None, dt: float, by: str | None = None) -> tuple[Array, Array]:
+        """Return value and Jacobian of `g` or `h` alone, of arguments that are known to be right; see `linearise`."""
+        f = getattr(self, name)
+        more = (u, dt)[: arity(f, 3 if name == "g" else 1) - 1]
+        size, angles = (self.nx, self.x_angles) if name == "g" else (self.ny, self.y_angles)
+        return self._linearised(name, f, x, more, size, angles, by)
 
     def _linearised(
         self,

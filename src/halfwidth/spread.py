@@ -4,7 +4,6 @@ Each has ``interval(level) -> (lo, hi)`` and the flag ``guaranteed``, so that sc
 estimator ran.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -256,6 +255,87 @@ class Normal:
 
 
 @dataclass(frozen=True, eq=False)
+class Both:
+    """The state is a Gaussian centre plus something bounded: ``x = mean + N(0, P) + b``, ``|b_i| <= half_i``.
+
+    Of b nothing is known but the bound: it may be a bias that never averages out. An interval of level p therefore
+    holds the state with probability p at least, whatever b is.
+
+    Parameters
+    ----------
+    mean : (nx,) or (T, nx) array
+    P : (nx, nx) or (T, nx, nx) array
+        Covariance of the centre, in squared units of the state.
+    half : (nx,) or (T, nx) array
+        Half-widths of the bounded part.
+
+    Examples
+    --------
+    >>> both = Both(np.array([0.0]), np.array([[1.0]]), np.array([2.0]))
+    >>> [float(end[0].round(3)) for end in (both.interval(0.95)[1], both.plain(2.0)[1])]
+    [3.645, 4.0]
+    """
+
+    mean: Array
+    P: Array
+    half: Array
+    guaranteed = False
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations of the centre, shaped as `mean`."""
+        return np.sqrt(np.maximum(np.diagonal(self.P, axis1=-2, axis2=-1), 0.0))
+
+    def interval(self, level: float = 0.9) -> tuple[Array, Array]:
+        """Return the shortest interval about the mean that holds the state with probability `level` for every b.
+
+        Its half-width is ``sd * biased_quantile(half / sd, level)``, below ``half + z sd`` of the two-sided quantile z.
+        """
+        from statistics import NormalDist
+
+        level, sd = _level(level), self.sd
+        inside = self.half < 1e6 * sd  # beyond, one end of the interval is all that counts
+        ratio = np.divide(self.half, sd, out=np.zeros_like(sd), where=inside)
+        far = self.half + max(NormalDist().inv_cdf(level), 0.0) * sd
+        size = np.where(inside, sd * biased_quantile(ratio, level), far)
+        return self.mean - size, self.mean + size
+
+    def through(self, D: Array) -> "Both":
+        """Return what is known of ``D x``: the bounded parts add up in the worst way."""
+        return Both(self.mean @ D.T, D @ self.P @ D.T, self.half @ np.abs(D).T)
+
+    def plain(self, kappa: float = 3.0) -> tuple[Array, Array]:
+        """Return mean minus and plus ``half + kappa * sd``, the interval of Hanebeck, Horn and Schmidt."""
+        size = self.half + kappa * self.sd
+        return self.mean - size, self.mean + size
+
+
+def biased_quantile(bias: Array, level: float) -> Array:
+    """Return the c with ``P(|N(bias, 1)| <= c) = level``, shaped as `bias`, which is not negative.
+
+    Newton's method between the one-sided and the two-sided quantile beside the bias, held by bisection.
+    """
+    from statistics import NormalDist
+
+    from scipy.special import ndtr
+
+    t = np.asarray(bias, dtype=np.float64)
+    lo = np.maximum(t + NormalDist().inv_cdf(level), 0.0)
+    hi = t + NormalDist().inv_cdf(0.5 + 0.5 * level)
+    c = lo.copy()
+    for _ in range(60):
+        miss = ndtr(t - c) + ndtr(-t - c) - (1.0 - level)  # falls as c grows
+        lo, hi = np.where(miss > 0, c, lo), np.where(miss > 0, hi, c)
+        slope = (np.exp(-0.5 * (t - c) ** 2) + np.exp(-0.5 * (t + c) ** 2)) / np.sqrt(2.0 * np.pi)
+        step = c + np.divide(miss, slope, out=np.zeros_like(c), where=slope > 0)
+        new = np.where((step >= lo) & (step <= hi), step, 0.5 * (lo + hi))
+        if np.all(np.abs(new - c) <= 1e-14 * np.maximum(c, 1.0)):
+            break
+        c = new
+    return np.asarray(c)
+
+
+@dataclass(frozen=True, eq=False)
 class Shaped:
     """The state has these moments: a Gaussian bent by skewness and kurtosis.
 
@@ -316,87 +396,6 @@ class Shaped:
 
 
 @dataclass(frozen=True, eq=False)
-class Both:
-    """The state is a Gaussian centre plus something bounded: ``x = mean + N(0, P) + b``, ``|b_i| <= half_i``.
-
-    Of b nothing is known but the bound: it may be a bias that never averages out. An interval of level p therefore
-    holds the state with probability p at least, whatever b is.
-
-    Parameters
-    ----------
-    mean : (nx,) or (T, nx) array
-    P : (nx, nx) or (T, nx, nx) array
-        Covariance of the centre, in squared units of the state.
-    half : (nx,) or (T, nx) array
-        Half-widths of the bounded part.
-
-    Examples
-    --------
-    >>> both = Both(np.array([0.0]), np.array([[1.0]]), np.array([2.0]))
-    >>> [float(end[0].round(3)) for end in (both.interval(0.95)[1], both.plain(2.0)[1])]
-    [3.645, 4.0]
-    """
-
-    mean: Array
-    P: Array
-    half: Array
-    guaranteed = False
-
-    @property
-    def sd(self) -> Array:
-        """Standard deviations of the centre, shaped as `mean`."""
-        return np.sqrt(np.maximum(np.diagonal(self.P, axis1=-2, axis2=-1), 0.0))
-
-    def interval(self, level: float = 0.9) -> tuple[Array, Array]:
-        """Return the shortest interval about the mean that holds the state with probability `level` for every b.
-
-        Its half-width is ``sd * biased_quantile(half / sd, level)``, below ``half + z sd`` of the two-sided quantile z.
-        """
-        from statistics import NormalDist
-
-        level, sd = _level(level), self.sd
-        inside = self.half < 1e6 * sd  # beyond, one end of the interval is all that counts
-        ratio = np.divide(self.half, sd, out=np.zeros_like(sd), where=inside)
-        far = self.half + max(NormalDist().inv_cdf(level), 0.0) * sd
-        size = np.where(inside, sd * biased_quantile(ratio, level), far)
-        return self.mean - size, self.mean + size
-
-    def through(self, D: Array) -> "Both":
-        """Return what is known of ``D x``."""
-        return Both(self.mean @ D.T, D @ self.P @ D.T, self.half @ np.abs(D).T)
-
-    def plain(self, kappa: float = 3.0) -> tuple[Array, Array]:
-        """Return mean minus and plus ``half + kappa * sd``, the interval of Hanebeck, Horn and Schmidt."""
-        size = self.half + kappa * self.sd
-        return self.mean - size, self.mean + size
-
-
-def biased_quantile(bias: Array, level: float) -> Array:
-    """Return the c with ``P(|N(bias, 1)| <= c) = level``, shaped as `bias`, which is not negative.
-
-    Newton's method between the one-sided and the two-sided quantile beside the bias, held by bisection.
-    """
-    from statistics import NormalDist
-
-    from scipy.special import ndtr
-
-    t = np.asarray(bias, dtype=np.float64)
-    lo = np.maximum(t + NormalDist().inv_cdf(level), 0.0)
-    hi = t + NormalDist().inv_cdf(0.5 + 0.5 * level)
-    c = lo.copy()
-    for _ in range(60):
-        miss = ndtr(t - c) + ndtr(-t - c) - (1.0 - level)  # falls as c grows
-        lo, hi = np.where(miss > 0, c, lo), np.where(miss > 0, hi, c)
-        slope = (np.exp(-0.5 * (t - c) ** 2) + np.exp(-0.5 * (t + c) ** 2)) / np.sqrt(2.0 * np.pi)
-        step = c + np.divide(miss, slope, out=np.zeros_like(c), where=slope > 0)
-        new = np.where((step >= lo) & (step <= hi), step, 0.5 * (lo + hi))
-        if np.all(np.abs(new - c) <= 1e-14 * np.maximum(c, 1.0)):
-            break
-        c = new
-    return np.asarray(c)
-
-
-@dataclass(frozen=True, eq=False)
 class Cloud:
     """The state is spread as weighted points.
 
@@ -435,43 +434,18 @@ class Cloud:
         return ends[0], ends[1]
 
 
-def newest(spread: Spread | None) -> Spread | None:
-    """Return what is known of the last row alone."""
+def part(spread: Spread | None, rows: slice) -> Spread | None:
+    """Return the spread of some rows of an answer."""
     if isinstance(spread, Box):
-        return Box(spread.lo[-1:], spread.hi[-1:], guaranteed=spread.guaranteed)
+        return Box(spread.lo[rows], spread.hi[rows], guaranteed=spread.guaranteed)
     if isinstance(spread, Normal):
-        return Normal.of(spread.mean[-1:], spread.P[-1:], spread._within)
+        return Normal.of(spread.mean[rows], spread.P[rows], spread._within)
     if isinstance(spread, Shaped):
-        return Shaped(spread.mean[-1:], spread.P[-1:], spread.skew[-1:], spread.kurt[-1:], spread.within)
+        return Shaped(spread.mean[rows], spread.P[rows], spread.skew[rows], spread.kurt[rows], spread.within)
     if isinstance(spread, Both):
-        return Both(spread.mean[-1:], spread.P[-1:], spread.half[-1:])
+        return Both(spread.mean[rows], spread.P[rows], spread.half[rows])
     if isinstance(spread, Cloud):
-        return Cloud(spread.points[-1:], spread.weights[-1:])
-    return None
-
-
-def joined(spreads: Sequence[Spread | None]) -> Spread | None:
-    """Return spreads of single rows as one, None where they are not of one kind."""
-
-    def rows(name: str) -> Array:
-        return np.concatenate([getattr(s, name) for s in spreads])
-
-    if all(isinstance(s, Box) for s in spreads):
-        return Box(rows("lo"), rows("hi"), guaranteed=all(s is not None and s.guaranteed for s in spreads))
-    if all(isinstance(s, Cloud) for s in spreads):
-        return Cloud(rows("points"), rows("weights"))
-    if all(isinstance(s, Both) for s in spreads):
-        return Both(rows("mean"), rows("P"), rows("half"))
-    if all(isinstance(s, Normal | Shaped) for s in spreads):
-        bent = [s if isinstance(s, Shaped) else None for s in spreads]
-        mean = rows("mean")
-        skew, kurt = (
-            np.concatenate([np.zeros((1, mean.shape[1])) if s is None else getattr(s, name) for s in bent])
-            for name in ("skew", "kurt")
-        )
-        last = spreads[-1]
-        within = last.within if isinstance(last, Shaped) else getattr(last, "_within", None)
-        return Shaped(mean, rows("P"), skew, kurt, within)
+        return Cloud(spread.points[rows], spread.weights[rows])
     return None
 
 

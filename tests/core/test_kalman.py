@@ -6,7 +6,7 @@ from tests import naive
 
 from halfwidth import _core
 
-SIZES = [(n, m) for n in range(1, 10) for m in range(1, 6)]
+SIZES = [(n, m) for n in range(1, 10) for m in range(1, 6)] + [(11, 3)]
 
 
 @pytest.fixture(params=["avx2", "base"])

@@ -140,8 +140,11 @@ def test_a_half_width_without_rows_keeps_its_prior():
     d = sample(model, record([[NAN], [NAN]]), draws=2000, seed=1)
     assert abs(d.s[..., 1].mean() - 1.0) < 0.05
     open_end = hw.Linear([[1]], None, [[1]], hw.Uniform(0.1), hw.Uniform.unknown(), hw.Box(-1, 1))
-    assert "0 rows and no upper bound" in _sample.improper(open_end, record([[NAN], [NAN]]), None)
-    assert _sample.improper(open_end, record([[NAN], [NAN]]), np.array([[0.0, 0.0], [1.0, 1.0]])) is None
+    with pytest.raises(hw.BadValue, match="1 rows, no upper bound"):
+        sample(open_end, record([[0.1], [NAN]]), draws=10, seed=1)
+    est = hw.estimate(open_end, record([[NAN], [NAN]]), hw.Posterior(method="sample", draws=200), seed=1)
+    assert "bound not identifiable" in est.info["notes"][0]
+    assert np.isfinite(est.r).all()
 
 
 def test_infeasible_records_have_no_draws():
@@ -185,3 +188,32 @@ def test_convergence_tells_chains_apart():
     for k in range(1, 5000):
         slow[:, k] = 0.9 * slow[:, k - 1] + rng.normal(size=4)
     assert abs(convergence(slow)[1] / (20000 * 0.1 / 1.9) - 1) < 0.35
+
+
+def test_posterior_by_draws_agrees_with_propagation():
+    """The same posterior twice: with known half-widths nothing of the priors is left."""
+    rng = np.random.default_rng(4)
+    model = hw.Linear(
+        [[1, 0.5], [0, 0.9]], None, [[1, 0]], hw.Uniform([0.1, 0.2]), hw.Uniform(0.5), hw.Box([-1, -1], [1, 1])
+    )
+    truth, rec = hw.simulate(model, None, T=15, seed=3)
+    y = np.array(rec.y)
+    y[4:7] = NAN
+    rec = hw.Record(rec.t, y)
+    drawn = hw.estimate(model, rec, hw.Posterior(method="sample", draws=1500), seed=int(rng.integers(100)))
+    fast = hw.estimate(model, rec, hw.Posterior())
+    sd = drawn.spread.points.std(axis=1)
+    assert drawn.status is hw.Status.OK
+    assert np.abs((fast.x - drawn.x) / sd).mean() < 0.08
+    lo, hi = drawn.interval(0.9)
+    assert np.mean((truth.x >= lo) & (truth.x <= hi)) > 0.7
+    again = hw.estimate(model, rec, hw.Posterior(method="sample", draws=1500), seed=drawn.info["seed"])
+    np.testing.assert_array_equal(again.x, drawn.x)
+
+
+def test_posterior_by_draws_says_when_nothing_fits():
+    model = hw.Linear([[1]], None, [[1]], hw.Uniform(0.1), hw.Uniform(0.1), hw.Box(-1, 1))
+    est = hw.estimate(model, record([[0.0], [5.0]]), hw.Posterior(method="sample", draws=10), seed=1)
+    assert est.status is hw.Status.INFEASIBLE
+    assert np.isfinite(est.x).all()
+    assert "BatchLP" in est.info["hint"]

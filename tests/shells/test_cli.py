@@ -467,3 +467,17 @@ def test_a_state_called_like_the_time_is_refused(tmp_path, capsys):
     out, err = capsys.readouterr()
     assert out == ""
     assert "a state is called 't'" in err
+
+
+def test_fill_on_a_map_within_limits(log, tmp_path):
+    with open(log, encoding="utf-8") as file:
+        fixes = [(float(row["lon_deg"]), float(row["lat_deg"])) for row in csv.DictReader(file) if row["lat_deg"]]
+    (tmp_path / "roads.geojson").write_text(json.dumps({"type": "LineString", "coordinates": fixes}))
+    given = ["fill", str(log), "-o", str(tmp_path / "track.csv"), "--map", str(tmp_path / "roads.geojson")]
+    found = done(*given, "--limits", "speed=-1:40,yaw_rate=1", "--json")
+    assert found.returncode == GOOD, found.stderr
+    assert json.loads(found.stdout)["method"] == "paper002"
+    wrong = done("fill", str(log), "-o", str(tmp_path / "other.csv"), "--limits", "speed")
+    assert wrong.returncode == BAD
+    assert b"NAME=SIZE" in wrong.stderr
+    assert done(*given, "--force", "--method", "em").returncode == BAD

@@ -9,7 +9,7 @@ end of the stock solver.
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +27,8 @@ _REPORT = 1e-6
 _ROUNDS = 3
 #: Most unknowns of the dense step that bounds states of an infinite box.
 _DENSE = 90
+#: Times that it is tried for a state.
+_TRIES = 30
 
 
 class Empty(NamedTuple):
@@ -73,6 +75,7 @@ class Boxes:
     proposers: Sequence[Proposer | None]
     loose: int = 0
     asked: int = 0
+    tries: dict[int, int] = field(default_factory=dict, repr=False)
 
     def sweep(self, windows: Sequence[tuple[int, int, int]]) -> tuple[Array, Array, int, Empty | None]:
         """Narrow the states k by windows (a, b, k), one after the other.
@@ -105,11 +108,14 @@ class Boxes:
         first, known = a, 0  # the window's first state, and how many states before the first that rows speak of
         found = self._solved(self._question(a, b, state), a)
         if found is None:
-            # Contraction alone leaves a state without a bound.
-            failed = self.finite(a, b)
-            if failed is not None:
-                return failed
+            # Contraction alone leaves a state without a bound. What a few tries with ever more rows leave so, stays so.
             lo, hi = self.lo[a : b + 1], self.hi[a : b + 1]
+            lost = np.flatnonzero(~(np.isfinite(lo) & np.isfinite(hi)).all(axis=1)) + a
+            if any(self.tries.get(k, 0) < _TRIES for k in lost.tolist()):
+                failed = self.finite(a, b)
+                if failed is not None:
+                    return failed
+                self.tries.update({k: self.tries.get(k, 0) + 1 for k in lost.tolist()})
             lost = np.flatnonzero(~(np.isfinite(lo) & np.isfinite(hi)).all(axis=1))
             if lost.size:
                 # Rows after the last unbounded state still hold all that they say of the states after it: it becomes a
@@ -232,7 +238,10 @@ class Boxes:
             return False
         scale = np.abs(M).sum(axis=1)
         scale = np.where(scale > 0, scale, 1.0)
-        Y = np.linalg.pinv(M / scale[:, None]) / scale
+        Q, T = np.linalg.qr(M / scale[:, None])
+        if not np.abs(np.diagonal(T)).min() > 1e-12:
+            return False
+        Y = np.linalg.solve(T, Q.T) / scale
         gamma = (len(M) + size + 8) * 4.5e-16
         R = np.abs(np.eye(size) - Y @ M) + np.abs(Y) @ radius * (1.0 + gamma)
         R = (R + gamma * (np.abs(Y) @ np.abs(M) + np.eye(size)) + 1e-290) * (1.0 + gamma)

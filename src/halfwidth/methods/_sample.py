@@ -22,16 +22,24 @@ from numpy.typing import NDArray
 
 import halfwidth._core as _core
 from halfwidth.array import Array, generator
+from halfwidth.errors import BadValue
+from halfwidth.methods._protocol import typed
 from halfwidth.methods._residuals import Residuals, reference, residuals
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.sequential import SequentialLP, filled
 from halfwidth.model import Linear, Model, needs_a_box
 from halfwidth.noise import Gaussian, Noise, Uniform
 from halfwidth.record import Record
-from halfwidth.spread import Box, Normal
+from halfwidth.result import Estimate, Status
+from halfwidth.spread import Box, Cloud, Normal
 
 #: A matrix entry that is unknown stands at this value while the pattern of the rows is built: any number but 0 and 1.
 _PLACE = 0.7310585786300049
+
+#: Chains that agree this well are good, and good enough to be used.
+_FINE, _USABLE = 1.01, 1.05
+#: Numbers of the cloud up to which every draw is returned.
+_KEPT = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,20 +87,6 @@ def refuses(model: Model) -> str | None:
     return None
 
 
-def improper(model: Linear, record: Record, prior: Array | None, power: float = 1.0) -> str | None:
-    """Return which half-width neither the record nor its prior bounds from above, or None."""
-    count = np.r_[np.full(model.nx, len(record)), record.seen.sum(axis=0)]
-    floor, cap, kind = _ends(model)
-    for j in np.flatnonzero((kind > 0) & (floor < cap) & np.isinf(cap) & (count <= power)):
-        if prior is None or not np.isfinite(prior[1, j]):
-            name = model.names.x[j] if j < model.nx else model.names.y[j - model.nx]
-            return (
-                f"the half-width of `{name}` has {int(count[j])} rows and no upper bound, so its posterior has no total"
-                "\nhint: Uniform.unknown(at_most=...)"
-            )
-    return None
-
-
 def sample(
     model: Linear,
     record: Record,
@@ -132,6 +126,11 @@ def sample(
     Returns
     -------
     Draws, or None if no trajectory fits the bounds.
+
+    Raises
+    ------
+    BadValue
+        If neither the rows of a half-width nor its prior bound it from above.
     """
     rng = generator(seed)
     rows = _rows(model, record)
@@ -149,6 +148,15 @@ def sample(
     tiny = 1e-9 * np.minimum(np.maximum(scale, 1e-290), np.where(cap > 0, cap, np.inf))
     if prior is None:
         prior = np.array([np.zeros(p), np.full(p, np.inf)])
+    loose = (kind > 0) & (floor < cap) & np.isinf(cap) & np.isinf(prior[1])
+    if np.any(loose & (count > 0) & (count <= power)):
+        j = int(np.argmax(loose & (count > 0) & (count <= power)))
+        name = [*model.names.x, *model.names.y][j]
+        raise BadValue(
+            f"the half-width of `{name}` has {count[j]} rows, no upper bound and a prior of power {power:g}, so its"
+            " posterior has no total",
+            hint="Uniform.unknown(at_most=...), or a lower power",
+        )
     normal = np.array([prior[0], np.where(np.isfinite(prior[1]), prior[1], 0.0)])
     place, first, weight = _places(rows.group, p, sd)
     at = rows.M.copy()
@@ -184,6 +192,73 @@ def sample(
         watched += [x[:, :, t, i] for i in range(nx) if np.ptp(x[:, :, t, i]) > 0]
     found = [convergence(v) for v in watched] or [(1.0, float(draws * chains))]
     return Draws(x, s, th, max(f[0] for f in found), min(f[1] for f in found))
+
+
+def sampled(
+    method: Any, model: Linear, record: Record, *, draws: int, chains: int, power: float, seed: int | None
+) -> Estimate:
+    """Return the estimate of a posterior by its draws.
+
+    Parameters
+    ----------
+    method : estimator
+        Named in the answer.
+    """
+    found = sample(model, record, draws=draws, chains=chains, power=power, seed=seed)
+    floor, cap, kind = _ends(model)
+    nx = model.nx
+    info: dict[str, Any] = {"seed": seed, "notes": []}
+    if found is None:
+        point = _bounded_point(model, record)
+        info |= {"x0": point.info["x0"], "hint": "BatchLP() names the rows in conflict"}
+        return Estimate(
+            record.t,
+            point.x,
+            None,
+            Status.INFEASIBLE,
+            typed(method),
+            names=model.names.x,
+            labels=record.labels,
+            info=info,
+        )
+    x = found.x.reshape(-1, *found.x.shape[2:])
+    s = found.s.reshape(-1, floor.size)
+    theta = found.theta.reshape(len(x), -1)
+    lo, hi = np.quantile(s[:, kind > 0], (0.05, 0.95), axis=0) if np.any(kind > 0) else (np.zeros(0), np.zeros(0))
+    full = {name: np.zeros(floor.size) for name in ("mean", "sd", "lo", "hi")}
+    for name, value in (("mean", s.mean(axis=0)), ("sd", s.std(axis=0))):
+        full[name] = np.where(kind > 0, value, 0.0)
+    full["lo"][kind > 0], full["hi"][kind > 0] = lo, hi
+    status = Status.OK if found.rhat <= _FINE else Status.REDUCED if found.rhat <= _USABLE else Status.STALLED
+    info |= {
+        "x0": x[:, 0].mean(axis=0), "half_widths": full, "rhat": found.rhat, "ess": found.ess,
+        "theta_sd": theta.std(axis=0),
+    }  # fmt: skip
+    if status is not Status.OK:
+        info["message"] = (
+            f"{status.value}: chains still differ, R-hat {found.rhat:.3f}, {found.ess:.0f} effective draws"
+        )
+        info["hint"] = f"draws={4 * draws}"
+    count = np.r_[np.full(nx, len(record)), record.seen.sum(axis=0)]
+    names = np.array([*model.names.x, *model.names.y])
+    unseen = (kind > 0) & (floor < cap) & (count == 0)
+    if unseen.any():
+        info["notes"].append("bound not identifiable: " + ", ".join(names[unseen]))
+    keep = slice(None, None, max(1, x[:, 1:].size // _KEPT))
+    points = np.ascontiguousarray(x[keep, 1:].swapaxes(0, 1))
+    return Estimate(
+        record.t,
+        x[:, 1:].mean(axis=0),
+        Cloud(points, np.full(points.shape[:2], 1.0 / points.shape[1])),
+        status,
+        typed(method),
+        q=full["mean"][:nx].copy() if kind[0] else None,
+        r=full["mean"][nx:].copy() if kind[-1] else None,
+        theta=theta.mean(axis=0) if theta.shape[1] else None,
+        names=model.names.x,
+        labels=record.labels,
+        info=info,
+    )
 
 
 def convergence(v: Array) -> tuple[float, float]:
@@ -431,15 +506,25 @@ def _definite(P: Array) -> Array:
     return np.asarray(P + np.diag(1e-12 * scale**2))
 
 
-def _start(model: Linear, record: Record, rows: _Rows) -> tuple[Array, Array, Array] | None:
-    """Return a trajectory inside all bounds (N,), theta, and the standard deviation of each row (K,); or None."""
-    floor, cap, kind = _ends(model)
+def _bounded(model: Linear) -> Linear:
+    """Return the model with bounded noise of unknown size instead of Gaussian noise, and a box as prior."""
     free = [
         noise if isinstance(noise, Uniform) else Uniform.unknown().sized(n, "noise")
         for noise, n in ((model.w, model.nx), (model.e, model.ny))
     ]
     prior = model.x0 if isinstance(model.x0, Box) else Box(np.full(model.nx, -np.inf), np.full(model.nx, np.inf))
-    bounded = replace(model, w=free[0], e=free[1], x0=prior)
+    return replace(model, w=free[0], e=free[1], x0=prior)
+
+
+def _bounded_point(model: Linear, record: Record) -> Estimate:
+    """Return the trajectory of least excess over the bounds."""
+    return (SequentialLP() if model.theta_entries else BatchLP()).run(_bounded(model), record)
+
+
+def _start(model: Linear, record: Record, rows: _Rows) -> tuple[Array, Array, Array] | None:
+    """Return a trajectory inside all bounds (N,), theta, and the standard deviation of each row (K,); or None."""
+    floor, cap, kind = _ends(model)
+    bounded = _bounded(model)
     if model.theta_entries:  # the warm-up finds its way into caps that no linearisation knows
         loose = [Uniform.unknown().sized(n, "noise") for n in (model.nx, model.ny)]
         found = SequentialLP().run(replace(bounded, w=loose[0], e=loose[1]), record)
@@ -487,11 +572,13 @@ def _places(group: NDArray[np.int64], p: int, sd: Array) -> tuple[NDArray[np.int
 def _from_prior(
     rng: np.random.Generator, draws: int, floor: Array, cap: Array, normal: Array, power: float, mine: NDArray[np.bool_]
 ) -> Array:
-    """Draw the half-widths that no row speaks of, (draws, k): their prior is their posterior."""
+    """Draw the half-widths that no row speaks of, (draws, k): their prior, or the floor where that has no end."""
     out = np.zeros((draws, int(mine.sum())))
     for k, j in enumerate(np.flatnonzero(mine)):
         if normal[1, j] > 0:
             out[:, k] = np.clip(np.exp(rng.normal(normal[0, j], normal[1, j], draws)), floor[j], cap[j])
+        elif np.isinf(cap[j]):
+            out[:, k] = floor[j]
         else:
             lo, hi = floor[j] ** power, cap[j] ** power
             out[:, k] = (lo + (hi - lo) * rng.uniform(size=draws)) ** (1.0 / power)

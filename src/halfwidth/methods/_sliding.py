@@ -39,7 +39,8 @@ from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.solvers.banded import Start, chain_of, solve
-from halfwidth.spread import Box, Spread, newest
+from halfwidth.spread import Both, Box, Cloud, Normal, Shaped, Spread
+from halfwidth.spread import part as rows_of_spread
 
 if TYPE_CHECKING:
     from halfwidth.methods.window import Window
@@ -128,7 +129,6 @@ class Sliding:
         self.theta = np.zeros(0)
         self.costs: Array | None = None
         self.start: Start | None = None
-        self.warm: Array | None = None  # half-widths that the next window's search starts from
         self.last: Solved | None = None
 
     def push(self, y: Array, u: Array | None, dt: float) -> Solved:
@@ -212,17 +212,12 @@ class Sliding:
             solved = self._program(method, model, part, a, costs)
             if solved is not None:
                 return solved
-        if hasattr(method, "answer") and isinstance(model, Linear) and not model.theta_entries:
-            answer = method.answer(model, part, start=self.warm)
-            est = answer.estimate
-            self.warm = answer.start.s if est.status.good else None
-        else:
-            est = method.run(model, part, seed=self.seed)
+        est = method.run(model, part, seed=self.seed)
         s = np.full(model.nx + model.ny, np.nan) if est.q is None or est.r is None else np.r_[est.q, est.r]
         info = {k: v for k, v in est.info.items() if k in ("solver", "objective", "notes", "message", "gap")}
         return Solved(
             np.vstack([est.info.get("x0", self.x[a]), est.x]), np.zeros(0) if est.theta is None else est.theta, s,
-            est.status, int(est.info.get("iterations", 0) or 0), info, newest(est.spread),
+            est.status, int(est.info.get("iterations", 0) or 0), info, rows_of_spread(est.spread, slice(-1, None)),
         )  # fmt: skip
 
     def _costs(self, model: Model, part: Record) -> Array:
@@ -256,14 +251,14 @@ class Sliding:
         rows: Any = rows_of(model, part, method.drift)
         x, theta = np.array(self.x[a:]), self.theta
         c = np.ones(rows.groups)
-        if isinstance(model, Nonlinear):
+        if isinstance(model, Nonlinear) or method.objective == "log" or method.point == "least_squares":
             early = self.pushed <= self.window.memory
             x = rows.start(theta) if early else x
-            if method.objective == "scaled":
+            if method.objective != "paper":
                 c = rows.weights(x, theta) if self.costs is None else self.costs
                 self.costs = None if early else c
             step = method.descend(rows, x, theta, c)
-            x, theta, status, answer, _ = step
+            x, theta, status, answer = step[:4]
             count = 0 if answer is None else answer.iterations
         else:
             if method.objective == "scaled":
@@ -304,7 +299,6 @@ class Sliding:
             "ahead": [plain(self.ahead.x), plain(self.ahead.q), self.ahead.grown.tolist()],
             "theta": self.theta.tolist(), "costs": None if self.costs is None else self.costs.tolist(),
             "start": None if self.start is None else [part.tolist() for part in self.start],
-            "warm": None if self.warm is None else self.warm.tolist(),
             "last": None if last is None else [last.theta.tolist(), plain([last.s])[0], last.status.name],
         }  # fmt: skip
 
@@ -334,11 +328,33 @@ class Sliding:
             self.start = (
                 x.reshape(-1, nx), theta, s, lam.reshape(-1, kinds, 2), box.reshape(-1, nx, 2), ends.reshape(-1, 2)
             )  # fmt: skip
-        self.warm = None if saved["warm"] is None else np.array(saved["warm"], dtype=float)
         self.last = None
         if saved["last"] is not None:
             theta, s, status = saved["last"]
             self.last = Solved(np.array(self.x), np.array(theta, dtype=float), arrays([s])[0], Status[status], 0, {})
+
+
+def stacked(spreads: list[Spread | None]) -> Spread | None:
+    """Return the spreads of single rows as one, None where they differ in kind."""
+    first = spreads[0]
+    if isinstance(first, Box) and all(isinstance(s, Box) for s in spreads):
+        lo, hi = (np.concatenate([getattr(s, end) for s in spreads]) for end in ("lo", "hi"))
+        return Box(lo, hi, guaranteed=all(s is not None and s.guaranteed for s in spreads))
+    if all(isinstance(s, Normal | Shaped) for s in spreads):
+        bent = [s if isinstance(s, Shaped) else _unbent(s) for s in spreads]
+        mean, P, skew, kurt = (np.concatenate([getattr(s, f) for s in bent]) for f in ("mean", "P", "skew", "kurt"))
+        return Shaped(mean, P, skew, kurt, bent[-1].within)
+    if isinstance(first, Both) and all(isinstance(s, Both) for s in spreads):
+        return Both(*(np.concatenate([getattr(s, f) for s in spreads]) for f in ("mean", "P", "half")))
+    if isinstance(first, Cloud) and all(isinstance(s, Cloud) for s in spreads):
+        points, weights = (np.concatenate([getattr(s, f) for s in spreads]) for f in ("points", "weights"))
+        return Cloud(points, weights)
+    return None
+
+
+def _unbent(spread: Any) -> Shaped:
+    none = np.zeros(spread.mean.shape)
+    return Shaped(spread.mean, spread.P, none, none, spread._within)
 
 
 class Live:

@@ -49,8 +49,9 @@ if TYPE_CHECKING:
 
 #: A window reaches back until it holds this many seen entries of every output, but at most so many memories.
 FIXES, STRETCH = 2, 10
-#: Without a memory, the first reach of a window; it doubles until a state gains less than GAIN of its width.
-REACH, GAIN = 10, 1e-5
+#: Without a memory, the first reach of a window; it doubles until a state gains less than GAIN of its width. What is
+#: left falls at least as fast as the reach grows, so that is much less than the last gain.
+REACH, GAIN = 10, 1e-3
 
 PROPOSERS: tuple[Proposer | None, ...] = (None, stock)
 #: Times that a nonlinear model is replaced by affine rows.

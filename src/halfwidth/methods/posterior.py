@@ -37,7 +37,7 @@ from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.spread import Box, Cloud, Normal, Shaped
+from halfwidth.spread import Box, Normal, Shaped
 
 _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
@@ -72,9 +72,6 @@ class Posterior:
 
     Parameters
     ----------
-    method : {"ep", "sample"}
-        Expectation propagation, or draws by Markov chains: slow, and the truth that the first is held against. Draws
-        take linear models of uniform or Gaussian noise; ``info["rhat"]`` says whether the chains agree.
     nodes : int
         Points over which unknown half-widths are integrated; 1 takes their mode as if it were the truth.
     outliers : float or bool
@@ -84,9 +81,18 @@ class Posterior:
         Most linearisations of a nonlinear model.
     iterations : int
         Most sweeps of one evaluation with everything known.
+    method : {"ep", "sample"}
+        "sample" draws Markov chains instead: exact in the limit, far slower, for linear models with uniform or
+        Gaussian noise. Its prior of a half-width is the power alone, without `told`.
+    draws, chains : int
+        Draws kept of each chain, and chains, of "sample".
 
     Notes
     -----
+    Of "sample" the spread is a `Cloud`, and ``info`` has ``rhat``, the largest rank-normalised split R-hat of states,
+    half-widths and entries, and ``ess``, their smallest effective number of draws; the status is REDUCED above an R-hat
+    of 1.01 and STALLED above 1.05. Of "ep":
+
     ``q``, ``r`` are posterior means. ``loglik`` is the logarithm of the evidence, half-widths integrated out under a
     prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
     count as a factor, not as a condition. In ``info``: ``x0``; ``half_widths``, a mapping with ``mean``, ``sd``, ``lo``
@@ -109,37 +115,37 @@ class Posterior:
     True
     """
 
-    method: Literal["ep", "sample"] = "ep"
     nodes: int = 64
     outliers: float | bool = False
     rounds: int = 20
     iterations: int = 200
+    method: Literal["ep", "sample"] = "ep"
+    draws: int = 1000
+    chains: int = 4
 
     def __post_init__(self) -> None:
-        if self.method not in ("ep", "sample"):
-            raise BadValue(f"`method` is {self.method!r}, 'ep' or 'sample' was expected")
         if not isinstance(self.nodes, int | np.integer) or self.nodes < 1:
             raise BadValue(f"`nodes` is {self.nodes!r}, a positive whole number was expected")
         if not isinstance(self.outliers, bool) and not 0 <= self.outliers < 1:
             raise BadValue(f"`outliers` is {self.outliers!r}, a share from 0 below 1, or True, was expected")
-        for name in ("rounds", "iterations"):
-            if not isinstance(getattr(self, name), int | np.integer) or getattr(self, name) < 1:
-                raise BadValue(f"`{name}` is {getattr(self, name)!r}, a positive whole number was expected")
+        for name, least in (("rounds", 1), ("iterations", 1), ("draws", 8), ("chains", 1)):
+            if not isinstance(getattr(self, name), int | np.integer) or getattr(self, name) < least:
+                raise BadValue(f"`{name}` is {getattr(self, name)!r}, a whole number from {least} was expected")
+        if self.method not in ("ep", "sample"):
+            raise BadValue(f"`method` is {self.method!r}, 'ep' or 'sample' was expected")
 
     def refuses(self, model: Model) -> str | None:
         """Return why the model is none of this method, with a hint, or None."""
+        if self.method == "sample":
+            from halfwidth.methods import _sample
+
+            if self.outliers:
+                return "`Posterior(method='sample')` finds no outliers\nhint: method='ep'"
+            return _sample.refuses(model)
         reason, hint = self._reason(model)
         return None if reason is None else f"`Posterior` {reason}\nhint: {hint}"
 
     def _reason(self, model: Model) -> tuple[str | None, str]:
-        if self.method == "sample":
-            from halfwidth.methods._sample import refuses
-
-            reason = refuses(model)
-            if self.outliers:
-                reason = "the sampler knows no outliers\nhint: method='ep'"
-            why, _, hint = (reason or "").partition("\nhint: ")
-            return (f"cannot draw: {why}", hint) if reason else (None, "")
         if model.nx > _MOST_STATES:
             return f"takes at most {_MOST_STATES} states but the model has {model.nx}", "a smaller model"
         if isinstance(model, Nonlinear) and model.loss is not None:
@@ -183,10 +189,12 @@ class Posterior:
         return None, ""
 
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:
-        """Estimate the states of one record; `seed` is for draws."""
+        """Estimate the states of one record; `seed` is that of "sample"."""
         if self.method == "sample":
+            from halfwidth.methods._sample import sampled
+
             assert isinstance(model, Linear)
-            return self._drawn(model, record, seed)
+            return sampled(self, model, record, draws=self.draws, chains=self.chains, power=POWER, seed=seed)
         if isinstance(model, Nonlinear):
             from halfwidth.methods._relinearise import relinearised
 
@@ -218,46 +226,6 @@ class Posterior:
                 start = Start(np.where(quick.chain.free, quick.start.s, math.sqrt(3.0) * problem.scale), None)
         found = self._solve(problem, model, start)
         return Answer(self._estimate(problem, found, model, record), problem, found)
-
-    def _drawn(self, model: Linear, record: Record, seed: int | None) -> Estimate:
-        """Return the posterior as a cloud of draws."""
-        from halfwidth.methods._sample import improper, sample
-
-        nx = model.nx
-        why = improper(model, record, None)
-        draws = None if why else sample(model, record, seed=seed)
-        if draws is None:
-            est = replace(self, method="ep").run(model, record)
-            said = (
-                {} if why is None else {"message": why.partition("\nhint: ")[0], "hint": why.partition("\nhint: ")[2]}
-            )
-            return replace(est, status=Status.INFEASIBLE, method=typed(self), loglik=None, info=dict(est.info) | said)
-        points = np.ascontiguousarray(np.moveaxis(draws.x.reshape(-1, *draws.x.shape[2:]), 0, 1))
-        s = draws.s.reshape(-1, draws.s.shape[-1])
-        x, mean = points.mean(axis=1), s.mean(axis=0)
-        status = Status.OK if draws.rhat <= 1.01 else Status.REDUCED if draws.rhat <= 1.1 else Status.STALLED
-        info = {
-            "x0": x[0],
-            "half_widths": {
-                "mean": mean, "sd": s.std(axis=0),
-                "lo": np.quantile(s, 0.05, axis=0), "hi": np.quantile(s, 0.95, axis=0),
-            },
-            "rhat": draws.rhat, "ess": draws.ess, "seed": seed, "notes": [],
-        }  # fmt: skip
-        weights = np.full((len(record), points.shape[1]), 1.0 / points.shape[1])
-        return Estimate(
-            record.t,
-            x[1:].copy(),
-            Cloud(points[1:], weights),
-            status,
-            typed(self),
-            q=mean[:nx].copy() if uniform_part(model.w) is not None else None,
-            r=mean[nx:].copy() if uniform_part(model.e) is not None else None,
-            theta=draws.theta.reshape(-1, draws.theta.shape[-1]).mean(axis=0) if draws.theta.shape[-1] else None,
-            names=model.names.x,
-            labels=record.labels,
-            info=info,
-        )
 
     def _solve(self, chain: Sites, model: Linear, start: "Start | None") -> dict[str, Any]:
         rate, learn_rate, beta = self._rate(model)

@@ -8,7 +8,13 @@ longer linear in what is sought. It is linearised about the newest estimate,
 which makes the problem the linear program of known matrices with a few dense columns for theta. Its solution is the
 next point; a step that does not lower the true objective ``sum c_j max|rho_j|`` is shortened. Bounds of theta hold
 throughout. A parameter may **drift**: it is then a straight line over the record, whose end is reported and whose total
-change is bounded.
+change is bounded. Where half-widths are known or capped the program about a poor point may have no solution although
+the problem has: the rows are then given slack, whose total is brought to nothing first.
+
+The **logarithmic** objective ``sum_j N_j ln s_j`` is the joint density itself, of which the others are linearisations:
+with T rows of states and K seen rows of outputs it is T times ``sum ln q_i + (K / T) sum ln r_j``. Its tangent lies
+above it, so that the linear program with costs ``N_j / s_j`` lowers it. It has no minimum at 0, hence every unknown
+half-width needs a floor: what the sensor's step or its data sheet says.
 
 ``Window(SequentialLP(rounds=1), memory)`` is the on-line LSU estimator of the paper: one linear program a row, about
 the last window's estimate.
@@ -16,7 +22,8 @@ the last window's estimate.
 References
 ----------
 Pavelková and Kárný (2013), eqs. (11), (12), (24)-(26), appendix A.2; the sign of the block that F's entries enter with
-is corrected (the coefficient of ``F[k, j]`` in row k is ``-y[j]``).
+is corrected (the coefficient of ``F[k, j]`` in row k is ``-y[j]``). Pavelková's slides on GPS and CAN data: the
+logarithmic objective.
 """
 
 import dataclasses
@@ -25,21 +32,30 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from halfwidth.array import Array
-from halfwidth.errors import BadValue
+from halfwidth.array import Array, real
+from halfwidth.errors import BadShape, BadValue
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._residuals import reference, residuals
-from halfwidth.model import Entry, Linear, Model, Nonlinear, needs_a_box
+from halfwidth.model import Entry, Linear, Model, Nonlinear, arity, needs_a_box
 from halfwidth.noise import Gaussian, Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.solvers.banded import Answer, Chain, chain_of, solve
+from halfwidth.solvers.banded import Answer, Chain, chain_of, solve, squares
 from halfwidth.spread import Box, Normal
+from halfwidth.trace import Tape, Untraceable, compiled
 
 #: Shares of a step that are tried, the whole one first.
 _STEPS = (1.0, 0.5, 0.25, 0.1, 0.03)
+#: Times that slack is used to find a point which fits the caps.
+_RESTORATIONS = 3
 #: Rounds in which the scale of each group is found for a nonlinear model.
 _SCALINGS = 3
+#: Total excess of rows over their caps, in units of the caps, that counts as none.
+_NONE = 1e-6
+#: A half-width within this factor of its floor sits on it.
+_ON_FLOOR = 1.0 + 1e-3
+#: Gauss-Newton steps to a state that gives the first outputs.
+_FITTING = 6
 #: A scale stays above this share of the cap (or of the first residuals): a smooth fit must not make one vanish.
 _LEAST = 0.03
 
@@ -50,18 +66,24 @@ class SequentialLP:
 
     Parameters
     ----------
-    objective : {"scaled", "paper"}
-        ``sum N_j s_j / sigma_j`` with the noise level sigma_j of a least-squares fit, or the paper's ``sum s_j``.
-    point : {"central", "optimal"}
-        Central points follow the central path to a relative gap of 0.3; they estimate better than optimal ones.
+    objective : {"scaled", "paper", "log"}
+        ``sum N_j s_j / sigma_j`` with the noise level sigma_j of a least-squares fit, the paper's ``sum s_j``, or
+        ``sum N_j ln s_j``, which starts at the scaled optimum and needs ``at_least`` above 0 for every unknown
+        half-width; ``info["on_floor"]`` names those that end there.
+    point : {"central", "least_squares", "optimal"}
+        Central points follow the central path to a relative gap of 0.3; they estimate better than optimal ones. For
+        the logarithm the path is that of the program at its optimum. Least squares is taken inside the optimal
+        half-widths, each row in units of its own.
     rounds : int
-        Most linearisations.
+        Most linearisations of each objective.
     tol : float
-        Relative decrease of the objective below which to stop.
+        Relative decrease of the objective below which to stop; of the logarithm, of the half-widths' mean.
     drift : float or None
         Largest change of each theta over the record; None keeps it constant.
     theta : tuple of float or None
         Where to start; 0 moved into the bounds if absent.
+    start : (T + 1, nx) array_like or None
+        Trajectory to start from; of least squares, or of an extended Kalman smoother, if absent.
 
     Raises
     ------
@@ -78,15 +100,19 @@ class SequentialLP:
     array([0.9])
     """
 
-    objective: Literal["scaled", "paper"] = "scaled"
-    point: Literal["central", "optimal"] = "central"
+    objective: Literal["scaled", "paper", "log"] = "scaled"
+    point: Literal["central", "least_squares", "optimal"] = "central"
     rounds: int = 30
     tol: float = 1e-4
     drift: float | None = None
     theta: tuple[float, ...] | None = None
+    start: Any = dataclasses.field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name, allowed in (("objective", ("scaled", "paper")), ("point", ("central", "optimal"))):
+        for name, allowed in (
+            ("objective", ("scaled", "paper", "log")),
+            ("point", ("central", "least_squares", "optimal")),
+        ):
             if getattr(self, name) not in allowed:
                 raise BadValue(f"`{name}` is {getattr(self, name)!r}, one of {', '.join(allowed)} was expected")
         if self.rounds < 1:
@@ -116,6 +142,12 @@ class SequentialLP:
             moving = [name for name in unknown if not model.matrices[name].constant]
             if moving:
                 return f"`SequentialLP` needs constant matrices where entries are unknown but `{moving[0]}` moves"
+        floor, cap = half_width_bounds(model)
+        if self.objective == "log" and np.any((floor < cap) & (floor <= 0)):
+            return (
+                "`SequentialLP(objective='log')` needs a floor above 0 for every unknown half-width: the logarithm has"
+                " no minimum at 0\nhint: Uniform.unknown(at_least=..., at_most=...)"
+            )
         if self.theta is not None and len(self.theta) != len(getattr(model, "theta_entries", ())):
             return f"`theta` has {len(self.theta)} entries, the model has {len(getattr(model, 'theta_entries', ()))}"
         return None
@@ -124,47 +156,188 @@ class SequentialLP:
         """Estimate states, half-widths and theta of one record."""
         rows = rows_of(model, record, self.drift)
         theta = start_theta(rows, self.theta)
-        x = rows.start(theta)
+        x = rows.start(theta) if self.start is None else _given(self.start, len(record), rows.nx)
         c = np.ones(rows.groups) if self.objective == "paper" else rows.weights(x, theta)
-        found = self.descend(rows, x, theta, c)
-        return finished(self, model, record, rows, c, found)
+        return finished(self, model, record, rows, self.descend(rows, x, theta, c))
 
     def descend(self, rows: "Rows", x: Array, theta: Array, c: Array) -> "Descent":
-        """Follow linearisations from (x, theta) as long as they lower the true objective."""
-        best = rows.worth(x, theta, c)
-        status, answer = Status.STALLED, None
-        history = [best]
+        """Follow linearisations from (x, theta) as long as they lower the true objective; go to the point asked for."""
+        log = self.objective == "log"
+        at = Descent(x, theta, Status.STALLED, None, [], c)
+        # the logarithm is concave: where it ends depends on where it starts
+        at = self._descended(rows, at, "optimal" if log or self.point == "least_squares" else self.point)
+        if log and at.status.good:
+            at = self._descended(rows, at, "optimal", log=True)
+        if at.status.good and self.point == "least_squares":
+            return _squared(rows, at)
+        return _centred(rows, at) if at.status.good and log and self.point == "central" else at
+
+    def _descended(self, rows: "Rows", at: "Descent", point: Any, *, log: bool = False) -> "Descent":
+        """Lower one objective, program by program, about the newest point."""
+        x, theta, status, answer, history, c = at
+
+        def worth(x: Array, theta: Array) -> float:
+            return rows.log_worth(x, theta) if log else rows.worth(x, theta, c)
+
+        best = worth(x, theta)
+        history = [*history, best]
+        first, restored, moved = not log, 0, False
         for _ in range(self.rounds):
-            answer = solve(rows.chain(x, theta, c), point=self.point)
+            if log:
+                c = rows.tangent(x, theta)
+            chain = rows.chain(x, theta, c)
+            if not all(np.isfinite(part).all() for part in (chain.A, chain.C, chain.bx, chain.by, chain.c)):
+                status = Status.STALLED  # g or h has no derivative here
+                break
+            answer = solve(chain, point=point, fallback=False)
             status = answer.status
+            if not status.good:
+                # a step is judged by the true objective, so it need not be certified, and neither need be the last one
+                if (
+                    status is Status.STALLED
+                    and _fits(rows, answer.x, answer.theta)
+                    and (worth(answer.x, answer.theta) < best)
+                ):
+                    status = Status.REDUCED
+                elif status is Status.STALLED and moved and _fits(rows, x, theta):
+                    status = Status.REDUCED
+                    break
+                else:
+                    answer = solve(chain, point=point)
+                    status = answer.status
+            if status is Status.INFEASIBLE and restored < _RESTORATIONS:
+                restored += 1
+                x, theta, fits = _restored(rows, x, theta, self.rounds)
+                if fits:
+                    best, first = worth(x, theta), True
+                    history.append(best)
+                    status = Status.REDUCED  # it fits as it is, should there be no rounds left to better it
+                    continue
             if not status.good:
                 break
             for share in _STEPS:
                 x_new, theta_new = x + share * (answer.x - x), theta + share * (answer.theta - theta)
-                value = rows.worth(x_new, theta_new, c)
+                value = worth(x_new, theta_new)
                 # The first point comes from least squares, which a central point need not beat.
-                if value < best or (len(history) == 1 and value < 2.0 * best):
+                if value < best or (first and value < 2.0 * best):
                     break
             else:
                 break
-            x, theta, gain, best = x_new, theta_new, best - value, value
+            x, theta, gain, best, moved = x_new, theta_new, best - value, value, True
             history.append(value)
-            if abs(gain) <= self.tol * max(abs(value), 1e-300) and len(history) > 2:
+            if abs(gain) <= self.tol * (1.0 if log else max(abs(value), 1e-300)) and not first:
                 break
-        return Descent(x, theta, status, answer, history)
+            first = False
+        return Descent(x, theta, status, answer, history, c)
 
 
 class Descent(NamedTuple):
-    """Where linearisations led: states, theta, how the last program went, and the objective after each."""
+    """Where linearisations led: states, theta, how the last program went, its answer, the objective's course, costs."""
 
     x: Array
     theta: Array
     status: Status
     answer: Answer | None
     history: list[float]
+    c: Array
 
 
-class LinearRows:
+def _fits(rows: "Rows", x: Array, theta: Array) -> bool:
+    """Whether a point is finite and its rows lie within their caps."""
+    if not (np.isfinite(x).all() and np.isfinite(theta).all()):
+        return False
+    return bool(np.all(largest(rows.residuals(x, theta), np.zeros(rows.groups)) <= rows.cap * (1.0 + 1e-6)))
+
+
+def _given(start: Any, T: int, nx: int) -> Array:
+    x = real(start, "start")
+    if x.shape != (T + 1, nx):
+        raise BadShape(f"`start` has shape {x.shape}, ({T + 1}, {nx}) was expected from the record and the model")
+    return x.copy()
+
+
+def _over(rows: "Rows", x: Array, theta: Array, unit: Array) -> float:
+    """Return the total excess of the rows over their caps, in units of the caps."""
+    return float(np.nansum(np.maximum(np.abs(rows.residuals(x, theta)) - rows.cap, 0.0) / unit))
+
+
+def _restored(rows: "Rows", x: Array, theta: Array, rounds: int) -> tuple[Array, Array, bool]:
+    """Bring the rows under their caps by programs with slack; return where that ends and whether they fit there."""
+    top = largest(rows.residuals(x, theta), rows.floor)
+    top = np.where(top > 0, top, 1.0)
+    unit = np.where(np.isfinite(rows.cap) & (rows.cap > 0), rows.cap, top)
+    over = _over(rows, x, theta, unit)
+    for _ in range(rounds):
+        # a half-width without a cap costs next to nothing: only what a cap forbids counts
+        chain = replace(rows.chain(x, theta, 1e-6 / top), slack=1.0 / unit)
+        answer = solve(chain, point="optimal")
+        if not np.isfinite(answer.x).all():
+            break
+        for share in _STEPS:
+            x_new, theta_new = x + share * (answer.x - x), theta + share * (answer.theta - theta)
+            value = _over(rows, x_new, theta_new, unit)
+            if value < over:
+                break
+        else:
+            break
+        x, theta, gain, over = x_new, theta_new, over - value, value
+        if over <= _NONE or gain <= 1e-3 * over:
+            break
+    return x, theta, over <= _NONE
+
+
+def _centred(rows: "Rows", at: "Descent") -> "Descent":
+    """Move to the central point of the last program, where states are estimated best."""
+    answer = solve(rows.chain(at.x, at.theta, at.c), point="central", fallback=False)
+    if answer.status is not Status.OK:
+        return at._replace(status=Status.REDUCED)
+    return at._replace(x=answer.x, theta=answer.theta, answer=answer)
+
+
+def _squared(rows: "Rows", at: "Descent") -> "Descent":
+    """Move to the least squares of the rows inside the half-widths of this point."""
+    s = largest(rows.residuals(at.x, at.theta), rows.floor)
+    found = squares(rows.chain(at.x, at.theta, at.c), s)
+    if found is None:
+        return at._replace(status=Status.REDUCED)
+    return at._replace(x=found[0], theta=found[1])
+
+
+class _Worth:
+    """What both kinds of rows are worth."""
+
+    floor: Array
+    cap: Array
+    nx: int
+
+    def residuals(self, x: Array, theta: Array) -> Array:
+        """Return the true residuals (T, groups), NaN where no row is."""
+        raise NotImplementedError
+
+    def worth(self, x: Array, theta: Array, c: Array) -> float:
+        """Return ``sum c_j max|rho_j|``."""
+        return float(c @ largest(self.residuals(x, theta), self.floor))
+
+    def shares(self, rho: Array) -> Array:
+        """Return N_j over the sum of all N of the half-widths sought, 0 of a known one."""
+        count = np.where(self.floor < self.cap, np.isfinite(rho).sum(axis=0), 0.0)
+        return np.asarray(count / max(float(count.sum()), 1.0))
+
+    def log_worth(self, x: Array, theta: Array) -> float:
+        """Return the mean of ``ln s_j`` over all rows."""
+        rho = self.residuals(x, theta)
+        share = self.shares(rho)
+        return float(share[share > 0] @ np.log(largest(rho, self.floor)[share > 0]))
+
+    def tangent(self, x: Array, theta: Array) -> Array:
+        """Return the costs of the program that lies above the logarithm and touches it here."""
+        rho = self.residuals(x, theta)
+        s = largest(rho, self.floor)
+        c = self.shares(rho) / np.where(s > 0, s, 1.0)
+        return c / max(float(c.max(initial=0.0)), 1e-300)
+
+
+class LinearRows(_Worth):
     """The rows of a linear model, linearised in theta; made by `rows_of`."""
 
     def __init__(self, model: Linear, record: Record, drift: float | None) -> None:
@@ -272,10 +445,6 @@ class LinearRows:
             rho += one.G @ full
         return rho
 
-    def worth(self, x: Array, theta: Array, c: Array) -> float:
-        """Return ``sum c_j max|rho_j|``."""
-        return float(c @ largest(self.residuals(x, theta), self.floor))
-
     def start(self, theta: Array) -> Array:
         """Return the least-squares trajectory at theta."""
         fixed = filled(self.model, theta[: len(self.entries)])
@@ -291,8 +460,11 @@ class LinearRows:
         return scaled_costs(np.r_[np.full(self.nx, len(self.record)), self.base.seen.sum(axis=0)], base.sigma)
 
 
-class NonlinearRows:
-    """The rows of a nonlinear model, linearised about a trajectory; made by `rows_of`."""
+class NonlinearRows(_Worth):
+    """The rows of a nonlinear model, linearised about a trajectory; made by `rows_of`.
+
+    An `h` that cannot be recorded may offer ``rows(x)``, values and Jacobians at many states at once.
+    """
 
     def __init__(self, model: Nonlinear, record: Record) -> None:
         self.model, self.record = model, record
@@ -304,17 +476,64 @@ class NonlinearRows:
         self.floor, self.cap = half_width_bounds(model)
         self.y = np.where(record.seen, record.y, 0.0)
         self.dt = record.steps(model.dt)
+        self.tapes: dict[str, Tape | None] = {}
 
-    def _along(self, x: Array) -> tuple[Array, Array, Array, Array]:
-        T = len(self.record)
-        g, h = np.empty((T, self.nx)), np.empty((T, self.ny))
-        g_x, h_x = np.empty((T, self.nx, self.nx)), np.empty((T, self.ny, self.nx))
-        for k in range(T):
-            u = None if self.record.u is None else self.record.u[k]
-            before = self.model.linearise(x[k], u, float(self.dt[k]))
-            after = self.model.linearise(x[k + 1], u, float(self.dt[k]))
-            g[k], g_x[k], h[k], h_x[k] = before.g, before.g_x, after.h, after.h_x
-        return g, g_x, h, h_x
+    def _tape(self, name: str, x: Array) -> Tape | None:
+        """Return g or h recorded, or None where it is for Python to call row by row."""
+        if name not in self.tapes:
+            f = getattr(self.model, name)
+            more = (self._inputs(slice(0, 1)), self.dt[:1])[: arity(f, 3 if name == "g" else 1) - 1]
+            one = tuple(None if a is None else a[0] for a in more)
+            sizes = (self.nx, self.model.nu, None)[: 1 + len(more)]
+            picks = [x[0], x[len(x) // 2], x[-1]]
+            try:
+                self.tapes[name] = compiled(f, sizes, [(point, *one) for point in picks])
+            except Untraceable:
+                self.tapes[name] = None
+        return self.tapes[name]
+
+    def _inputs(self, rows: slice) -> Array | None:
+        if not self.model.nu:
+            return None
+        return np.zeros((len(self.record), self.model.nu))[rows] if self.record.u is None else self.record.u[rows]
+
+    def _values(self, name: str, x: Array) -> Array:
+        """Return g or h at each row's state, (T, nx) or (T, ny)."""
+        if name == "h" and hasattr(self.model.h, "rows"):
+            return np.asarray(self.model.h.rows(x)[0])
+        tape, u = self._tape(name, x), self._inputs(slice(None))
+        if tape is not None:
+            more = (u, self.dt[:, None])[: len(tape.sizes) - 1]
+            return tape(x, *(np.zeros((1, 0)) if a is None else a for a in more))
+        if name == "h":
+            return np.array([self.model.output(row) for row in x])
+        rows = zip(x, self.dt, strict=True)
+        return np.array(
+            [self.model.move(row, None if u is None else u[k], float(h)) for k, (row, h) in enumerate(rows)]
+        )
+
+    def _linearised(self, name: str, x: Array, u: Array | None, k: int) -> tuple[Array, Array]:
+        """Return g or h and its Jacobian at one state, where nothing is recorded."""
+        by = "differences" if getattr(self.model, f"{name}_x") is None else "user"
+        return self.model.slope(name, x, u, float(self.dt[k]), by)
+
+    def _along(self, x: Array, rows: int | None = None) -> tuple[Array, Array, Array, Array]:
+        """Return g and g_x at the states before each row, h and h_x at those of the row; of the first rows."""
+        found: list[Array] = []
+        u, dt = self._inputs(slice(rows)), self.dt[:rows]
+        for name, at in (("g", x[:-1]), ("h", x[1:])):
+            if name == "h" and hasattr(self.model.h, "rows"):
+                found += [np.ascontiguousarray(part) for part in self.model.h.rows(at)]
+                continue
+            tape = self._tape(name, at) if getattr(self.model, f"{name}_x") is None else None
+            if tape is not None:
+                more = (u, dt[:, None])[: len(tape.sizes) - 1]
+                value, slope = tape.jacobian(at, *(np.zeros((1, 0)) if a is None else a for a in more))
+            else:
+                each = [self._linearised(name, row, None if u is None else u[k], k) for k, row in enumerate(at)]
+                value, slope = np.array([row[0] for row in each]), np.array([row[1] for row in each])
+            found += [np.ascontiguousarray(value), np.ascontiguousarray(slope)]
+        return found[0], found[1], found[2], found[3]
 
     def _wrapped(self, difference: Array, angles: tuple[int, ...]) -> Array:
         if angles:
@@ -350,20 +569,11 @@ class NonlinearRows:
 
     def residuals(self, x: Array, theta: Array) -> Array:  # noqa: ARG002
         """Return the true residuals (T, groups), NaN where no row is."""
-        T = len(self.record)
-        rho = np.empty((T, self.groups))
-        for k in range(T):
-            u = None if self.record.u is None else self.record.u[k]
-            rho[k, : self.nx] = x[k + 1] - self.model.move(x[k], u, float(self.dt[k]))
-            rho[k, self.nx :] = self.model.output(x[k + 1]) - self.y[k]
+        rho = np.hstack([x[1:] - self._values("g", x[:-1]), self._values("h", x[1:]) - self.y])
         self._wrapped(rho[:, : self.nx], self.model.x_angles)
         rho[:, self.nx :] = self._wrapped(rho[:, self.nx :], self.model.y_angles)
         rho[:, self.nx :][~self.record.seen] = np.nan
         return rho
-
-    def worth(self, x: Array, theta: Array, c: Array) -> float:
-        """Return ``sum c_j max|rho_j|``."""
-        return float(c @ largest(self.residuals(x, theta), self.floor))
 
     def start(self, theta: Array) -> Array:  # noqa: ARG002
         """Return the trajectory of an extended Kalman smoother with the widest noise that the caps allow."""
@@ -373,7 +583,7 @@ class NonlinearRows:
         x0 = self.model.x0
         if isinstance(x0, Box):
             half = np.where(np.isfinite(x0.hi - x0.lo), 0.5 * (x0.hi - x0.lo), 1e3)
-            x0 = Normal(x0.mean, np.diag(np.maximum(half, 1e-9) ** 2 / 3.0))
+            x0 = Normal(self._fitting(x0), np.diag(np.maximum(half, 1e-9) ** 2 / 3.0))
         gaussian = dataclasses.replace(
             self.model, w=Gaussian(np.diag(top[: self.nx])), e=Gaussian(np.diag(top[self.nx :])), x0=x0, bounds=None
         )
@@ -385,18 +595,47 @@ class NonlinearRows:
             x = np.tile(x0.mean, (len(self.record) + 1, 1))
         return x if self.model.bounds is None else np.clip(x, self.model.bounds.lo, self.model.bounds.hi)
 
+    def _fitting(self, box: Box) -> Array:
+        """Return a state of the box that gives the first outputs seen, as nearly as Gauss-Newton finds one.
+
+        The middle of a wide box may be where an output has no derivative, such as the azimuth of a line of no length.
+        """
+        seen = self.record.seen
+        first = np.argmax(seen, axis=0)
+        there = seen.any(axis=0)
+        y = np.where(there, self.record.y[first, np.arange(self.ny)], 0.0)
+        room = np.where(np.isfinite(box.hi - box.lo), box.hi - box.lo, 1.0)
+        aside = np.clip(box.mean + 1e-3 * np.minimum(room, 1.0) * np.cos(np.arange(1.0, self.nx + 1)), box.lo, box.hi)
+        x = aside
+        for _ in range(_FITTING):
+            h, h_x = (part[0] for part in self._along(np.vstack([x, x]), 1)[2:])
+            if not (np.isfinite(h).all() and np.isfinite(h_x).all()):
+                return np.asarray(box.mean)
+            miss = self._wrapped((y - h)[None], self.model.y_angles)[0]
+            step = np.linalg.lstsq(h_x[there], miss[there], rcond=None)[0]
+            x = np.clip(x + step, box.lo, box.hi)
+        return np.asarray(x if np.isfinite(x).all() else box.mean)
+
     def weights(self, x: Array, theta: Array) -> Array:
         """Return N_j / sigma_j with the noise level of a least-squares fit about x."""
         count = np.r_[np.full(self.nx, len(self.record)), self.record.seen.sum(axis=0)].astype(float)
-        sigma = np.where(np.isfinite(self.cap), self.cap, np.nanstd(self.residuals(x, theta), axis=0) + 1e-12)
-        least = _LEAST * sigma
+        sigma = np.where(np.isfinite(self.cap), self.cap, self._level(self.residuals(x, theta)) + 1e-12)
+        # what a start happens to fit exactly has a floor all the same
+        sigma = np.maximum(sigma, self.floor)
+        least = np.maximum(_LEAST * sigma, self.floor)
         for _ in range(_SCALINGS):
             chain = self.chain(x, theta, 1.0 / np.maximum(sigma, 1e-300))
             smooth = solve(chain, point="least_squares", fallback=False).x
+            if not np.isfinite(smooth).all():
+                break
             rho = chain_residuals(chain, smooth)
-            level = np.sqrt(np.nanmean(np.where(np.isnan(rho), 0.0, rho) ** 2, axis=0))
-            sigma = np.maximum(level, least)
+            sigma = np.maximum(self._level(rho), least)
         return scaled_costs(count, sigma)
+
+    def _level(self, rho: Array) -> Array:
+        """Return the root mean square of each group's residuals, 0 where it has none."""
+        there = np.isfinite(rho)
+        return np.asarray(np.sqrt((np.where(there, rho, 0.0) ** 2).sum(axis=0) / np.maximum(there.sum(axis=0), 1)))
 
 
 Rows = LinearRows | NonlinearRows
@@ -486,31 +725,36 @@ def chain_residuals(chain: Chain, x: Array) -> Array:
     return np.hstack([w, e])
 
 
-def finished(
-    method: SequentialLP,
-    model: Model,
-    record: Record,
-    rows: Rows,
-    c: Array,
-    found: Descent,
-) -> Estimate:
-    """Return the estimate of a descent."""
-    x, theta, status, answer, history = found
+def finished(method: SequentialLP, model: Model, record: Record, rows: Rows, at: Descent) -> Estimate:
+    """Return the estimate at a point."""
+    x, theta, status, answer, history, c = at
     rho = rows.residuals(x, theta)
     s = largest(rho, rows.floor)
     over = s > rows.cap * (1.0 + 1e-6)
     notes = []
+    if status is Status.INFEASIBLE:
+        notes.append("this is the trajectory of least excess over the caps that was found")
     if over.any() and status.good:
         status = Status.REDUCED
         notes.append("the linearisation leaves residuals beyond the caps")
+    free = rows.floor < rows.cap
+    kinds = [f"q[{name}]" for name in model.names.x] + [f"r[{name}]" for name in model.names.y]
+    low = free & (rows.floor > 0) & (s <= _ON_FLOOR * rows.floor) & np.isfinite(rho).any(axis=0)
+    on_floor = [name for name, here in zip(kinds, low, strict=True) if here]
+    if on_floor:
+        notes.append(f"half-width on its floor: {', '.join(on_floor)}")
     n = len(rows.entries)
+    count = np.where(free, np.isfinite(rho).sum(axis=0), 0)
+    log = float(count[count > 0] @ np.log(s[count > 0])) if method.objective == "log" else None
     info: dict[str, Any] = {
         "x0": x[0].copy(),
-        "objective": float(c @ s),
+        "objective": float(c @ s) if log is None else log,
         "rounds": len(history) - 1,
         "history": history,
         "w": rho[:, : rows.nx],
         "e": -rho[:, rows.nx :],
+        "rows": count,
+        "on_floor": on_floor,
         "notes": notes,
         "iterations": 0 if answer is None else answer.iterations,
         "solver": "banded" if answer is None else answer.by,

@@ -44,6 +44,7 @@ from halfwidth.methods._sliding import (
     Sliding,
     first_costs,
     rows_since_fix,
+    stacked,
     window_lasts,
     window_starts,
 )
@@ -53,7 +54,7 @@ from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.solvers.banded import POINTS, STATUSES, Chain, chain_of, solve
-from halfwidth.spread import Box, Spread, joined
+from halfwidth.spread import Box, Spread
 
 
 @dataclass(frozen=True)
@@ -231,7 +232,7 @@ class Window:
             info["message"] = f"{worst.value}: {len(unsolved)} of {T} windows, the first at row {unsolved[0]}"
         if np.any(since > 0) and "message" not in info:
             info["message"] = f"{worst.value}; {int(np.count_nonzero(since > 0))} rows extrapolate beyond the last fix"
-        spread = joined(found.spreads) if len(found.spreads) == T else None
+        spread = stacked(found.spreads) if len(found.spreads) == T else None
         theta = found.theta[-1] if found.theta is not None and found.theta.shape[1] else None
         s = found.s[-1]
         known = np.isfinite(s).all() and found.statuses[-1].good

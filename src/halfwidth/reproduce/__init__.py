@@ -5,13 +5,17 @@ reference are those printed in the papers; notes say what cannot match and why.
 """
 
 import importlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from halfwidth.errors import BadValue
 
 #: Papers that are reproduced here, by number.
-PAPERS: dict[str, str] = {"000": "paper000", "001": "paper001", "003": "paper003", "004": "paper004"}
+PAPERS: dict[str, str] = {"000": "paper000", "001": "paper001", "002": "paper002", "003": "paper003", "004": "paper004"}
+
+#: Those whose experiments can also be run on a vehicle's logs.
+ON_LOGS = ("000", "002")
 
 
 @dataclass(frozen=True)
@@ -46,9 +50,18 @@ def paper(number: str) -> Any:
     return importlib.import_module(f"halfwidth.reproduce.{PAPERS[number]}")
 
 
-def tables(number: str, *, quick: bool = False) -> tuple[Table, ...]:
-    """Return the tables of a paper; `quick` runs a small part of each experiment."""
-    found: tuple[Table, ...] = paper(number).tables(quick=quick)
+def tables(number: str, *, quick: bool = False, logs: Sequence[str] = ()) -> tuple[Table, ...]:
+    """Return the tables of a paper; `quick` runs a small part of each experiment, `logs` are files of drives.
+
+    Raises
+    ------
+    BadValue
+        If the paper is not reproduced here, or there are logs and it is not about vehicles.
+    """
+    module = paper(number)
+    if logs and number not in ON_LOGS:
+        raise BadValue(f"paper {number} is not about vehicles, so `logs` has no use: {', '.join(ON_LOGS)} are")
+    found: tuple[Table, ...] = module.tables(quick=quick, logs=tuple(logs)) if logs else module.tables(quick=quick)
     return found
 
 

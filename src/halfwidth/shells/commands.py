@@ -5,6 +5,7 @@ imported by the command that needs it.
 """
 
 import json
+import math
 import os
 import shlex
 import sys
@@ -126,7 +127,31 @@ def fill(
     report: Annotated[str | None, typer.Option(metavar="HTML", help="Report to write: one HTML page.")] = None,
     method: Annotated[str | None, typer.Option(metavar="NAME", help="Estimator; the default needs no tuning.")] = None,
     level: Level = 0.9,
+    guaranteed: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--guaranteed",
+            metavar="ACCELERATION FIX",
+            help="Add a band that must contain the vehicle while its acceleration stays within ACCELERATION m/s^2 and"
+            " every fix within FIX m of the truth, each east and north; in columns of its own.",
+            show_default=False,
+        ),
+    ] = None,
     clock_offset: ClockOffset = None,
+    second: Annotated[
+        str | None, typer.Option(metavar="LOG", help="Fixes of a second antenna on the same clock (method paper002).")
+    ] = None,
+    map_: Annotated[
+        str | None, typer.Option("--map", metavar="GEOJSON", help="Roads that gaps are kept on (method paper002).")
+    ] = None,
+    limits: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME=MOST,...",
+            help="Limits of speed, acceleration, yaw_rate, altitude, pitch (method paper002):"
+            " speed=0:30,acceleration=4,yaw_rate=0.8 in m/s, m/s^2, rad/s, m, rad.",
+        ),
+    ] = None,
     columns: Columns = None,
     json_: Json = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Read and check everything, write nothing.")] = False,
@@ -156,8 +181,18 @@ def fill(
         _writable(path, log, force)
     if output is not None:
         _ending_known(output, format_)
-    job = Job("fill", log, method=method, level=level, settings={"clock_offset": clock_offset},
-              columns=parse_columns(columns or ""))  # fmt: skip
+    if guaranteed is not None and not all(0 < v < math.inf for v in guaranteed):
+        raise _usage(f"`--guaranteed` is {guaranteed[0]:g} {guaranteed[1]:g}, two positive numbers are expected",
+                     "--guaranteed 4 3")  # fmt: skip
+    settings: dict[str, Any] = {"clock_offset": clock_offset}
+    settings |= {name: value for name, value in (("second", second), ("roads", map_)) if value is not None}
+    if guaranteed is not None:
+        settings["guaranteed"] = list(guaranteed)
+    if limits is not None:
+        from halfwidth.vehicle.antennas import parsed_limits
+
+        settings["limits"] = parsed_limits(limits)
+    job = Job("fill", log, method=method, level=level, settings=settings, columns=parse_columns(columns or ""))
     if dry_run:
         found = read(log, columns=job.columns)
         outputs = [path for path in (output, report) if path is not None]
@@ -400,7 +435,10 @@ def doctor(json_: Json = False) -> int:
 
 @app.command(epilog="Example: halfwidth reproduce 003 --quick")
 def reproduce(
-    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000, 001, 003 or 004.")],
+    paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000 to 004.")],
+    logs: Annotated[
+        list[str] | None, typer.Argument(metavar="LOG...", help="Logs of drives to run papers 000 and 002 on as well.")
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A small part of each experiment.")] = False,
     json_: Json = False,
 ) -> int:
@@ -410,7 +448,9 @@ def reproduce(
     if paper not in papers.PAPERS:
         known = ", ".join(papers.PAPERS)
         raise _usage(f"`{paper}` is no paper that is reproduced here, one of {known} is expected", "reproduce 003")
-    found = papers.tables(paper, quick=quick)
+    if logs and paper not in papers.ON_LOGS:
+        raise _usage(f"paper {paper} is not about vehicles, a log has no use", f"reproduce {papers.ON_LOGS[-1]} LOG")
+    found = papers.tables(paper, quick=quick, logs=logs or ())
     if json_:
         tables = [
             {"title": t.title, "header": list(t.header), "rows": [list(r) for r in t.rows], "notes": list(t.notes)}
@@ -581,6 +621,9 @@ def _track_json(track: Any, written: Mapping[str, str | None], command: str, sec
             }
             for gap in track.gaps
         ],
+        "guaranteed": None
+        if track.proven is None
+        else {"acceleration": track.proven.acceleration, "fix": track.proven.fix, "rests_on": track.proven.words},
         "settings": dict(track.settings),
         "messages": list(track.messages),
         "written": dict(written),

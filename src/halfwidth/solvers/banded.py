@@ -391,6 +391,43 @@ class Shifted:
     known: NDArray[np.bool_]
 
 
+def squares(chain: Chain, s: Array, relax: tuple[float, ...] = (1e-6, 1e-4)) -> tuple[Array, Array] | None:
+    """Return states and theta of least squares inside given half-widths, each row in units of its own; None if none.
+
+    Parameters
+    ----------
+    chain : Chain
+        Its own costs, floors and caps are not looked at.
+    s : (ns,) array
+        Half-widths.
+    relax : tuple of float
+        Shares by which they are widened, the second where the first leaves too little room.
+    """
+    import scipy.sparse as sp
+
+    given = chain.program()
+    n, K = given.G.shape[1] - len(s), given.G.shape[0] // 2
+    M = sp.csr_array(given.G)[:K, :n]
+    S = -sp.csr_array(given.G)[:K, n:]
+    b = given.row_hi[:K]
+    limit = S @ s
+    size = np.where(limit > 0, limit, max(float(limit.max(initial=0.0)), 1.0))
+    M, b = sp.csr_array(sp.diags_array(1.0 / size) @ M), b / size
+    for widened in relax:
+        room = np.where(limit > 0, 1.0 + widened, widened)
+        found = proved(
+            Program(
+                c=np.asarray(-(M.T @ b)), G=M, row_lo=b - room, row_hi=b + room,
+                lo=given.lo[:n], hi=given.hi[:n], P=sp.csr_array(M.T @ M), floor=1e-3,
+            ),
+            (PIQP,),
+        )  # fmt: skip
+        if found.solved and found.x is not None:
+            p0 = n - (chain.T + 1) * chain.bx.shape[1]
+            return found.x[: n - p0].reshape(chain.T + 1, -1), found.x[n - p0 :]
+    return None
+
+
 def _claim(program: Program) -> Claim | None:
     """Adapter for `halfwidth.solvers.lp`: None unless the program carries the chain it was built from."""
     given = program.chain

@@ -18,6 +18,7 @@ _HOME: dict[str, str] = {
     "Log": "log",
     "METHODS": "estimators",
     "Outages": "outage",
+    "Roads": "roads",
     "Track": "track",
     "calibrated": "align",
     "check": "check",
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from halfwidth.vehicle.models import two_antenna_linear as two_antenna_linear
     from halfwidth.vehicle.outage import Outages as Outages
     from halfwidth.vehicle.outage import outages as outages
+    from halfwidth.vehicle.roads import Roads as Roads
     from halfwidth.vehicle.sensors import Calibration as Calibration
     from halfwidth.vehicle.track import Gap as Gap
     from halfwidth.vehicle.track import Track as Track

@@ -117,7 +117,7 @@ class Demo:
                 *lines,
                 "",
                 f"stated: the largest half-width at level {track.level:g}, east or north, of where the receiver would",
-                "have seen the vehicle. inside: true positions within both, although its slow error cannot be seen.",
+                "have seen the vehicle. inside: true positions within both, although nobody sees its slow error.",
                 "",
                 f"log     {self.log}",
                 f"track   {self.output}",

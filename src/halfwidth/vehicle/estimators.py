@@ -16,12 +16,14 @@ slp-white     the same, the fix error without an offset
 slp-log       that with the logarithmic objective
 paper000      GPS/INS by linear programming, half-widths unknown, as printed in Pavelková (2011)
 paper000+ls   the same, least squares inside the optimal half-widths
-paper002      the linearised two-antenna model with one antenna, middle azimuth, least squares likewise
+paper002      GPS and CAN of Pavelková's slides: nonlinear, two antennas or one, logarithmic objective, floors
+paper002-3d   the same with altitude and pitch
+paper002lin   its linearised model with one antenna, middle azimuth, least squares inside the optimal half-widths
 ============= ==================================================================================================
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -36,11 +38,13 @@ from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Normal
-from halfwidth.vehicle import bounded, chain, models
+from halfwidth.vehicle import antennas, bounded, chain, models
+from halfwidth.vehicle.antennas import TwoAntennas
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pointing import azimuth_of
+from halfwidth.vehicle.roads import Streets
 
 Floats = NDArray[np.float64]
 Tuned = Mapping[str, float]
@@ -339,6 +343,30 @@ def _ins(drive: Grid) -> tuple[Linear, Floats]:
     return models.gps_ins(drive.h), _acceleration(drive)
 
 
+def antennas_by(settings: TwoAntennas) -> Callable[[Sequence[Grid], Tuned], list[Path]]:
+    """Return the two-antenna estimator with these settings, as a method runs it."""
+    return lambda drives, tuned: antennas.solve(drives, settings)  # noqa: ARG005
+
+
+def with_limits(asked: Method | None, limits: Mapping[str, Any] | None, roads: Streets | None) -> Method:
+    """Return a method that keeps the track within limits and on roads: the two-antenna one, in 3D if asked for.
+
+    Raises
+    ------
+    BadValue
+        If another method was asked for, or a limit is none.
+    """
+    chosen = METHODS["paper002"] if asked is None else asked
+    if chosen.name not in ("paper002", "paper002-3d"):
+        raise BadValue(
+            f"`method` is {chosen.name!r}, but limits, a map and a second antenna are for the two-antenna model",
+            hint='method="paper002"',
+        )
+    held = antennas.limits_of(limits or {})
+    settings = TwoAntennas(height=chosen.name == "paper002-3d", limits=held, roads=roads)
+    return replace(chosen, run=antennas_by(settings))
+
+
 def _two_antenna(drive: Grid) -> tuple[Linear, Floats]:
     moved = models.displacement(azimuth_of(drive), drive.speed, drive.h)
     return models.two_antenna_linear(antennas=1), moved
@@ -403,8 +431,16 @@ METHODS: Mapping[str, Method] = MappingProxyType(
                 _SENSORS,
                 _programme(_ins, objective="paper", point="least_squares"),
             ),
+            Method("paper002", "two-antenna GPS/CAN model, MAP", 10.0, _SENSORS, antennas_by(TwoAntennas())),
             Method(
-                "paper002",
+                "paper002-3d",
+                "the same with altitude and pitch",
+                10.0,
+                _SENSORS,
+                antennas_by(TwoAntennas(height=True)),
+            ),
+            Method(
+                "paper002lin",
                 "linearised two-antenna model, one antenna, least squares",
                 10.0,
                 _SENSORS,

@@ -25,15 +25,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
-from halfwidth.vehicle import calibrate, chain
+from halfwidth.vehicle import calibrate, chain, proven
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.distrust import distrusted
-from halfwidth.vehicle.estimators import COLOURS, METHODS, Method, heading_of, usable
+from halfwidth.vehicle.estimators import COLOURS, METHODS, Method, heading_of, usable, with_limits
 from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path, sized
+from halfwidth.vehicle.roads import roads_of
 from halfwidth.vehicle.stray import strays
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
 
@@ -73,6 +74,10 @@ def fill(
     level: float = 0.9,
     clock_offset: float | None = None,
     distrust: bool = True,
+    second: Any = None,
+    roads: Any = None,
+    limits: Mapping[str, Any] | None = None,
+    guaranteed: tuple[float, float] | None = None,
 ) -> Track:
     """Fill the gaps of a log.
 
@@ -91,6 +96,19 @@ def fill(
     distrust : bool
         Whether fixes that only repeat the one before while the car moves are found and bridged; the track's messages
         name them.
+    second : Log, path or frame, optional
+        Fixes of a second antenna, on the clock of the first one's. This, `roads` and `limits` are for the two-antenna
+        model, which is the method where one of them is given and `method` is absent.
+    roads : path, dict or Roads, optional
+        GeoJSON with lines: inside gaps the track stays on them, within `half_width` or half the `width` of their
+        properties, or 5 m. A gap beside which the fixes are off the roads is left as it is, and the messages say so.
+    limits : mapping of str to float or (float, float), optional
+        Largest size, or least and largest value, of ``speed`` (m/s), ``acceleration`` (m/s^2), ``yaw_rate`` (rad/s),
+        ``altitude`` (m) and ``pitch`` (rad).
+    guaranteed : (float, float), optional
+        Declared half-widths: the acceleration that the car never passes, m/s^2, and the error that no fix passes, m,
+        each east and north. The track then has a band that must contain the car if both are true, in `Track.proven`;
+        it does not touch the half-widths. Fixes that contradict the two are named, and there is no band.
 
     Returns
     -------
@@ -104,10 +122,15 @@ def fill(
     BadLog
         If the log cannot be read or has no fix.
     BadValue
-        If `level`, `method` or `clock_offset` is none.
+        If `level`, `method`, `clock_offset`, `roads` or one of `limits` is none, or the method does not take them.
     """
     level, offset = level_of(level), clock_offset_of(clock_offset)
+    bounds = None if guaranteed is None else proven.declared(guaranteed)
     asked = None if method is None else method_of(method)
+    held = second is not None or roads is not None or limits is not None
+    asked = with_limits(asked, limits, None) if held else asked
+    known_roads = None if roads is None else roads_of(roads)
+    beside = None if second is None else as_log(second)[0]
     drive_log, native = as_log(log)
     if not drive_log.fixed.any():
         raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
@@ -119,10 +142,13 @@ def fill(
     drive_log = _with_pauses_filled(drive_log, messages)
     sensors = calibrated(drive_log, clock_offset=None if clock_offset is None else offset)
     messages.extend(sensors.words())
-    grid = sampled(drive_log, sensors=sensors)
+    grid = sampled(drive_log, sensors=sensors, second=beside)
+    if known_roads is not None:
+        asked = with_limits(asked, limits, known_roads.local(grid.frame))
     chosen = _chosen(grid, asked, messages)
     wanted, quality = _wanted(drive_log)
     t = drive_log.t[wanted]
+    believed = grid.seen
     if distrust:
         stray = strays(grid, sensors)
         messages.extend(filter(None, [stray.words(grid)]))
@@ -136,15 +162,20 @@ def fill(
     z = NormalDist().inv_cdf(0.5 + level / 2)
     half = _half_widths(columns, answers, grid, away, z, t, quality)
     arm_east, arm_north = sensors.arm(t)
-    lat, lon = grid.frame.to_geodetic(columns.east + arm_east, columns.north + arm_north)
+    east, north = columns.east + arm_east, columns.north + arm_north
+    lat, lon = grid.frame.to_geodetic(east, north)
     gaps = gaps_of(t, lat, lon, half.max(axis=1), quality)
     settings: dict[str, object] = {"context": CONTEXT, "sensors": sensors.to_dict()}
     settings.update(answers.settings)
+    band = None
+    if bounds is not None:
+        off = np.isin(t, grid.t[believed & ~grid.seen])  # what is not believed bounds nothing
+        band = _proven(drive_log, wanted, off, grid, np.column_stack((east, north)), bounds, messages)
     return Track(
         t_s=t,
         lat_deg=lat,
         lon_deg=lon,
-        alt_m=_altitude(drive_log, t),
+        alt_m=_altitude(drive_log, t, answers.paths),
         azimuth_rad=np.mod(columns.azimuth, 2 * np.pi),
         speed_mps=columns.speed,
         east_half_m=half[:, 0],
@@ -161,7 +192,28 @@ def fill(
         settings=settings,
         messages=tuple(messages),
         native=native,
+        proven=band,
     )
+
+
+def _proven(
+    log: Log,
+    wanted: NDArray[np.intp],
+    off: NDArray[np.bool_],
+    grid: Grid,
+    track: Floats,
+    bounds: tuple[float, float],
+    messages: list[str],
+) -> proven.Proven | None:
+    """Return the band of the declared half-widths about a track (M, 2), or say which fixes contradict them."""
+    east, north = grid.frame.to_local(log.lat_deg[wanted], log.lon_deg[wanted])
+    fixes = np.column_stack((east, north))
+    fixes[off] = np.nan
+    found = proven.band(log.t[wanted], fixes, *bounds)
+    if isinstance(found, str):
+        messages.append(f"no guaranteed band: the log contradicts the declared half-widths: {found}")
+        return None
+    return proven.about(track[:, 0], track[:, 1], *found, *bounds)
 
 
 def level_of(given: Any) -> float:
@@ -411,6 +463,7 @@ def _estimated(
     grids = [piece.grid for piece in pieces]  # of which the chain takes away the fixes it cannot believe
     able = [i for i, grid in enumerate(grids) if chosen.name == "linear" or int(grid.seen.sum()) >= FEWEST]
     found, rerun, settings = _ran(chosen, grids, able, messages)
+    messages.extend(dict.fromkeys(note for path in found.values() for note in path.info.get("notes", ())))
     failed = [i for i in range(len(grids)) if i not in found or not _plausible(found[i], grids[i])]
     if failed and chosen.name != "linear":
         messages.append(_failed_words(chosen, [pieces[i] for i in failed], len(pieces)))
@@ -834,7 +887,11 @@ def _half_widths(
     return np.minimum(half, limit[:, None])
 
 
-def _altitude(log: Log, t: Floats) -> Floats:
-    """Interpolate the heights that the log has."""
+def _altitude(log: Log, t: Floats, paths: Sequence[Path]) -> Floats:
+    """Return the heights that the method found, or else interpolate those that the log has."""
+    if paths and all("altitude" in path.info for path in paths):
+        at, found = (np.concatenate(parts) for parts in zip(*((p.t, p.info["altitude"]) for p in paths), strict=True))
+        order = np.argsort(at, kind="stable")
+        return np.asarray(np.interp(t, at[order], found[order]))
     clock, height = log.stream("alt_m")
     return np.interp(t, clock, height) if clock.size else np.full(t.size, np.nan)

@@ -8,8 +8,8 @@ known of the sensors (`Calibration`). Where a sensor was silent its mean is an i
 """
 
 from bisect import bisect_left
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,12 @@ class Grid:
     has_speed, has_yaw_rate : bool
         Whether the log has the sensor at all; without it the means are 0.
     frame : Frame
+    second : (T, 2) array or None
+        East and north of a second antenna's fixes at the nodes, NaN where there is none.
+    height : (T,) array or None
+        Height of the fixes, m, NaN where there is none.
+    steps : mapping of str to float
+        Quantisation steps of the streams that have one.
     """
 
     t: Floats
@@ -71,6 +77,9 @@ class Grid:
     has_speed: bool
     has_yaw_rate: bool
     frame: Frame
+    second: Floats | None = None
+    height: Floats | None = None
+    steps: Mapping[str, float] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return int(self.t.size)
@@ -87,7 +96,7 @@ class Grid:
 
     def rows(self, rows: slice) -> "Grid":
         """Return a stretch of nodes."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in _ARRAYS})
+        return replace(self, **{name: getattr(self, name)[rows] for name in _ARRAYS if getattr(self, name) is not None})
 
     def without(self, t0: float, t1: float) -> "Grid":
         """Return the grid with fixes and courses of ``t0 <= t <= t1`` hidden."""
@@ -100,6 +109,10 @@ class Grid:
         interpolated from node to node around it, as `sampled` does where a log lacks them.
         """
         grid = replace(self, seen=self.seen & ~hidden, course=np.where(hidden, np.nan, self.course))
+        if self.second is not None:
+            grid = replace(grid, second=np.where(hidden[:, None], np.nan, self.second))
+        if self.height is not None:
+            grid = replace(grid, height=np.where(hidden, np.nan, self.height))
         for name in silent:
             if getattr(self, f"has_{name}"):
                 mean, sd = _silenced(self.t, hidden, getattr(self, name), getattr(self, f"{name}_sd"), *DRIFT[name])
@@ -108,11 +121,16 @@ class Grid:
         return grid
 
 
-_ARRAYS = ("t", "east", "north", "seen", "course", "speed", "yaw_rate", "speed_sd", "yaw_rate_sd")
+_ARRAYS = ("t", "east", "north", "seen", "course", "speed", "yaw_rate", "speed_sd", "yaw_rate_sd", "second", "height")
 
 
 def sampled(
-    log: Log, *, clock_offset: float = 0.0, frame: Frame | None = None, sensors: Calibration = AS_LOGGED
+    log: Log,
+    *,
+    clock_offset: float = 0.0,
+    frame: Frame | None = None,
+    sensors: Calibration = AS_LOGGED,
+    second: Log | None = None,
 ) -> Grid:
     """Put a log on one clock.
 
@@ -127,6 +145,8 @@ def sampled(
     sensors : Calibration
         What is known of the sensors, each put right by it. Where it knows the place of the antenna, the nodes are
         those of the axle: `Calibration.arm` leads back.
+    second : Log, optional
+        Fixes of a second antenna, on the clock of the first one's.
 
     Returns
     -------
@@ -170,7 +190,28 @@ def sampled(
         has_speed=streams["speed"][0].size > 0,
         has_yaw_rate=streams["yaw_rate"][0].size > 0,
         frame=frame,
+        second=None if second is None else _beside(second, t, seen, frame) - np.column_stack((arm_east, arm_north)),
+        height=_at_nodes(*log.stream("alt_m"), t, seen),
+        steps=dict(sensors.steps),
     )
+
+
+def _beside(log: Log, t: Floats, seen: Mask, frame: Frame) -> Floats:
+    """Return east and north (T, 2) of another log's fixes at the nodes that have one; NaN where it has none."""
+    fixed = log.fixed
+    places = frame.to_local(log.lat_deg[fixed], log.lon_deg[fixed])
+    return np.column_stack([_at_nodes(log.t[fixed], values, t, seen) for values in places])
+
+
+def _at_nodes(clock: Floats, values: Floats, t: Floats, seen: Mask) -> Floats:
+    """Return a stream at the nodes with a fix, interpolated between samples that are close together; NaN elsewhere."""
+    if clock.size == 0:
+        return np.full(t.size, np.nan)
+    k = np.clip(np.searchsorted(clock, t), 1, max(clock.size - 1, 1))
+    left, right = np.maximum(k - 1, 0), np.minimum(k, clock.size - 1)
+    nearest = np.minimum(np.abs(t - clock[left]), np.abs(clock[right] - t))
+    between = (t >= clock[left]) & (t <= clock[right]) & (clock[right] - clock[left] <= _APART)
+    return np.where(seen & (between | (nearest <= _CLOSE)), np.interp(t, clock, values), np.nan)
 
 
 def _thinned(t: Floats) -> list[int]:

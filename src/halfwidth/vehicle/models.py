@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from halfwidth.errors import BadValue
 from halfwidth.model import Linear, Names, Nonlinear, Prior
 from halfwidth.noise import Gaussian, Mixed, Uniform
-from halfwidth.spread import Normal
+from halfwidth.spread import Box, Normal
 
 Floats = NDArray[np.float64]
 Given = ArrayLike | Uniform | Gaussian | Mixed | None
@@ -124,9 +125,20 @@ def two_antenna_linear(q: Given = None, r: Given = None, *, antennas: int = 2, x
 
 
 def two_antenna(
-    q: Given, r: Given, *, x0: Prior, baseline: tuple[float, float] | None = None, euler: bool = False
+    q: Given,
+    r: Given,
+    *,
+    x0: Prior,
+    baseline: tuple[float, float] | None = None,
+    euler: bool = False,
+    antennas: int = 2,
+    rigid: bool = False,
+    heading: bool = False,
+    height: bool = False,
+    acceleration: bool = False,
+    bounds: Box | None = None,
 ) -> Nonlinear:
-    """Return the seven-state model of a vehicle with two antennas.
+    """Return the seven-state model of a vehicle with two antennas, or one of its relatives.
 
     State: east1, north1, east2, north2 (m), azimuth (rad), speed (m/s), yaw_rate (rad/s). Output: the two positions,
     azimuth, speed and yaw rate. The azimuth output is that of the line from antenna 1 to antenna 2 plus what the line
@@ -134,7 +146,7 @@ def two_antenna(
 
     Parameters
     ----------
-    q, r : (7,) half-widths, or a noise
+    q, r : (nx,) and (ny,) half-widths, or a noise
         Noise of state and output.
     x0 : Box or Normal
         Prior of the state.
@@ -143,24 +155,66 @@ def two_antenna(
         the azimuth output is the azimuth state itself.
     euler : bool
         Move along the azimuth at the start of the step, as the slides do, instead of that in its middle.
+    antennas : {1, 2}
+        With one antenna the first position only, and no `baseline`.
+    rigid : bool
+        The line between the antennas turns with the vehicle. In the slides both move alike, and what a turn does to
+        the second one is left to the noise.
+    heading : bool
+        A further output, last but for the altitude: the azimuth state itself, beside that of the line.
+    height : bool
+        Two further states, altitude (m) and pitch (rad, nose up): the vehicle climbs by ``sin pitch`` of the way it
+        goes and moves across the map by ``cos pitch`` of it. A further output, the last: the altitude.
+    acceleration : bool
+        A further state, the last: acceleration (m/s^2), which the speed follows from one step to the next; the speed
+        is that of the whole step that follows.
+    bounds : Box, optional
+        Restrictions on the states.
 
     Returns
     -------
     Nonlinear
     """
+    if antennas not in (1, 2) or (antennas == 1 and baseline is not None):
+        raise BadValue(f"`antennas` is {antennas!r}, 2, or 1 without a `baseline`, is expected")
     turned = None if baseline is None else float(np.arctan2(baseline[1], baseline[0]))
+    a = 2 * antennas  # where the azimuth stands
+    n = a + 3 + 2 * height
 
     def g(x: Any, u: Any, dt: Any) -> Any:  # noqa: ARG001 - the signature of a model
-        azimuth = x[4] if euler else x[4] - 0.5 * dt * x[6]
-        ahead, across = dt * x[5] * np.sin(azimuth), dt * x[5] * np.cos(azimuth)
-        return np.array([x[0] + ahead, x[1] + across, x[2] + ahead, x[3] + across, x[4] - dt * x[6], x[5], x[6]])
+        azimuth = x[a] if euler else x[a] - 0.5 * dt * x[a + 2]
+        way = dt * x[a + 1]
+        flat = way * np.cos(x[a + 4]) if height else way
+        moved = [x[k] + flat * (np.cos(azimuth) if k % 2 else np.sin(azimuth)) for k in range(a)]
+        if rigid and antennas == 2:
+            sin, cos = np.sin(-dt * x[a + 2]), np.cos(-dt * x[a + 2])
+            line = x[2] - x[0], x[3] - x[1]
+            moved[2:] = [moved[0] + line[0] * cos + line[1] * sin, moved[1] - line[0] * sin + line[1] * cos]
+        moved += [x[a] - dt * x[a + 2], x[a + 1] + (dt * x[n] if acceleration else 0.0), x[a + 2]]
+        moved += [x[a + 3] + way * np.sin(x[a + 4]), x[a + 4]] if height else []
+        return np.array(moved + ([x[n]] if acceleration else []))
 
     def h(x: Any) -> Any:
-        course = x[4] if turned is None else np.arctan2(x[2] - x[0], x[3] - x[1]) + turned
-        return np.array([x[0], x[1], x[2], x[3], course, x[5], x[6]])
+        course = x[a] if turned is None else np.arctan2(x[2] - x[0], x[3] - x[1]) + turned
+        seen = [*(x[k] for k in range(a)), course, x[a + 1], x[a + 2]]
+        return np.array(seen + ([x[a]] if heading else []) + ([x[a + 3]] if height else []))
 
-    names = ("east1", "north1", "east2", "north2", "azimuth", "speed", "yaw_rate")
-    return Nonlinear(g, h, _noise(q), _noise(r), x0, names=Names(names, names, ()), x_angles=(4,), y_angles=(4,))
+    numbers = ("1", "2") if antennas == 2 else ("",)
+    x0 = x0.sized(n + acceleration, "x0") if isinstance(x0, Box) else x0
+    places = tuple(f"{axis}{k}" for k in numbers for axis in ("east", "north"))
+    states = (*places, "azimuth", "speed", "yaw_rate", *(("altitude", "pitch") if height else ()))
+    outputs = (*states[: a + 3], *(("heading",) if heading else ()), *(("altitude",) if height else ()))
+    return Nonlinear(
+        g,
+        h,
+        _noise(q),
+        _noise(r),
+        x0,
+        names=Names(states + (("acceleration",) if acceleration else ()), outputs, ()),
+        bounds=bounds,
+        x_angles=(a,),
+        y_angles=(a, a + 3) if heading else (a,),
+    )
 
 
 def ctrv(q: Given, r: Given, *, x0: Prior | None = None, theta: bool = False, euler: bool = False) -> Nonlinear:

@@ -514,6 +514,12 @@ def _charts(track: Track) -> dict[str, dict[str, Any]]:
     top = _top(float(both.max()) if both.size else 1.0)
     bottom = -_top(-float(both.min())) if both.size and both.min() < -0.05 else 0.0
     half = _top(float(track.half_m.max()))
+    proven: dict[str, dict[str, Any]] = {}
+    if track.proven is not None:
+        sides = track.proven.half_m[np.isfinite(track.proven.half_m)]
+        wide = _top(float(sides.max()) if sides.size else 1.0)
+        marks = [(v, f"{v:g}") for v in picture.steps(0, wide, 4).tolist()]
+        proven["proven"] = {"low": 0.0, "high": wide, "lines": [], "marks": marks}
     return {
         "speed": {
             "low": bottom,
@@ -533,6 +539,7 @@ def _charts(track: Track) -> dict[str, dict[str, Any]]:
             "lines": [["east", "l-east"], ["north", "l-north"]],
             "marks": [(v, f"{v:g}") for v in picture.steps(0, half, 4).tolist()],
         },
+        **proven,
     }
 
 
@@ -593,12 +600,38 @@ def _chart_section(track: Track, charts: Mapping[str, Mapping[str, Any]]) -> str
             ),
         ),
     ]
+    if track.proven is not None:
+        figures.append(_proven_figure(track, charts, key))
     start = "" if _zero(track) == 0 else " from the first row"
     return (
         '<section aria-labelledby="chart-title">\n<h2 id="chart-title">Along the drive</h2>\n'
         f'<p class="about">Time in seconds{start}; gaps are shaded. <span class="live hide">Showing a'
         " gap zooms into its time here too; “Whole drive” returns.</span></p>\n"
         f"{''.join(figures)}</section>\n"
+    )
+
+
+def _proven_figure(track: Track, charts: Mapping[str, Mapping[str, Any]], key: str) -> str:
+    """Draw the guaranteed band, which is no half-width and shares nothing with them but the clock."""
+    assert track.proven is not None
+    t, t0, t1, top = track.t_s, float(track.t_s[0]), float(track.t_s[-1]), charts["proven"]["high"]
+    half = np.where(np.isfinite(track.proven.half_m), track.proven.half_m, np.nan)
+    east, north = (picture.chart_path(t, half[:, k], t0, t1, 0.0, top) for k in (0, 1))
+    columns = track.proven.columns
+    return _figure(
+        track,
+        "proven",
+        charts,
+        "Guaranteed band",
+        f"m, half of the box that must contain the vehicle; {track.proven.words}",
+        f'<path class="one" d="{east}"/><path class="two" d="{north}"/>',
+        key.format("one", "east") + key.format("two", "north"),
+        _behind_chart(
+            track,
+            ["to the west, m", "to the east, m", "to the south, m", "to the north, m"],
+            list(columns.values()),
+            "{:.2f}",
+        ),
     )
 
 

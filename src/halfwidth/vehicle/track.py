@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     import os
     from datetime import datetime
 
+    from halfwidth.vehicle.proven import Proven
+
 Floats = NDArray[np.float64]
 
 #: What a row can be: a row with a fix, a row between two fixes, a row before the first fix or after
@@ -124,6 +126,8 @@ class Track:
         What a reader of the track must know.
     native : {"pandas", "polars", "pyarrow"}
         The library whose frame `frame` returns: that of the frame that came in.
+    proven : Proven, optional
+        A band of its own from declared half-widths, in columns of its own; never part of the half-widths.
 
     Raises
     ------
@@ -152,6 +156,7 @@ class Track:
     settings: Mapping[str, object] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
     native: str = "pandas"
+    proven: "Proven | None" = None
 
     def __post_init__(self) -> None:
         t = _column("t_s", self.t_s, None)
@@ -185,6 +190,8 @@ class Track:
             raise BadValue(f"`level` is {self.level}, between 0 and 1 is expected", hint="level=0.9")
         if self.guarantee not in GUARANTEES:
             raise BadValue(f"`guarantee` is {self.guarantee!r}, one of {', '.join(GUARANTEES)} is expected")
+        if self.proven is not None and self.proven.proven_west_m.shape != t.shape:
+            raise BadShape(f"`proven` has {self.proven.proven_west_m.size} rows but `t_s` has {t.size}")
         object.__setattr__(self, "gaps", tuple(self.gaps))
         object.__setattr__(self, "messages", tuple(str(message) for message in self.messages))
         object.__setattr__(self, "settings", MappingProxyType(dict(self.settings)))
@@ -203,6 +210,11 @@ class Track:
         larger: Floats = np.maximum(self.east_half_m, self.north_half_m)
         return larger
 
+    @property
+    def proven_columns(self) -> dict[str, Floats]:
+        """The columns of the guaranteed band, in metres from the position; none without it."""
+        return {} if self.proven is None else self.proven.columns
+
     def rows_of(self, gap: Gap) -> tuple[int, int]:
         """Find the rows of a gap, the fixes at its ends included: first row, row after the last."""
         first = min(int(np.searchsorted(self.t_s, gap.start)), self.t_s.size - 1)
@@ -220,7 +232,7 @@ class Track:
         -------
         DataFrame or Table
             The columns ``t_s, lat_deg, lon_deg, alt_m, azimuth_rad, speed_mps, east_half_m,
-            north_half_m, quality, since_fix_s``.
+            north_half_m, quality, since_fix_s``, and those of `proven` where there is one.
 
         Raises
         ------
@@ -229,6 +241,7 @@ class Track:
         """
         columns = {name: getattr(self, name) for name in COLUMNS}
         columns["quality"] = self.quality.astype(object)
+        columns.update(self.proven_columns)
         return to_frame(columns, self.native if native is None else native)
 
     def write(

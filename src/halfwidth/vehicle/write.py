@@ -259,7 +259,9 @@ def _csv(track: Track, _: Start) -> bytes:
             columns.append([repr(t) for t in np.round(track.t_s, 9).tolist()])
         else:
             columns.append(_texts(getattr(track, name), _DECIMALS[name]))
-    lines = [",".join(COLUMNS), *map(",".join, zip(*columns, strict=True)), ""]
+    proven = track.proven_columns
+    columns += [_texts(values, 3) for values in proven.values()]
+    lines = [",".join((*COLUMNS, *proven)), *map(",".join, zip(*columns, strict=True)), ""]
     return "\n".join(lines).encode()
 
 
