@@ -129,6 +129,7 @@ struct EpFound {
     V* slope;     // (groups + 1,): d log Z / d log s, d log Z / d logit eps
     V* learned;   // (groups,): sum over the rows of a half-width of (1 - posterior / prior variance)^2
     V worst;      // smallest log of the share of a cavity that lies in its factor's box
+    V top;        // what the evidence cannot exceed: every row as dense as its noise can be
     V far;        // largest squared distance of a site's mean from its cavity's, in the cavity's variances
 };
 
@@ -314,6 +315,7 @@ struct Ep {
     inline void rows(int t, V* ms, V* Ps, EpFound& f, double damping) {
         for (int k = a.start[t]; k < a.start[t + 1]; k++) {
             const bool fixed = kind(k) == noise_gaussian;
+            if constexpr (!renew) f.top += densest(k);
             if (fixed) {
                 if constexpr (!renew) {
                     f.log_z -= V(0.5) * V(log_2pi + std::log(a.R[k]));
@@ -371,6 +373,15 @@ struct Ep {
     // log of the width of a row's box: with it the log of a density becomes that of a share
     inline V unit(int k) const {
         return kind(k) != ep_truncation && a.group[k] >= 0 ? of(log4(2.0 * s.s[a.group[k]].v + 1e-300)) : V(0.0);
+    }
+
+    // log of the largest density of a row's noise
+    inline V densest(int k) const {
+        if (kind(k) == ep_truncation) return V(0.0);
+        const V half = a.group[k] >= 0 ? s.s[a.group[k]] : V(0.0), R = variance(k);
+        const V box = -of(log4(2.0 * half.v + 1e-300)), bell = V(-0.5) * of(log4(6.283185307179586 * R.v + 1e-300));
+        const V most = smaller(box, bell);
+        return kind(k) == noise_maybe_lost ? larger(most, V(a.lost[k])) : most;
     }
 
     inline void slopes(int k, const Tilted4& q, const V& v, EpFound& f) const {
@@ -780,6 +791,7 @@ struct Ep {
 
     void clear(EpFound& f) const {
         f.residual = V(0.0);
+        f.top = V(0.0);
         f.far = V(0.0);
         f.log_z = V(0.0);
         f.worst = V(1e300);
@@ -815,7 +827,7 @@ struct Ep {
         backward<false>(f);
     }
     static inline bool sound(const EpFound& f, int l) {
-        return finite(f.log_z[l]) && finite(f.residual[l]) && f.worst[l] > -60.0;
+        return finite(f.log_z[l]) && finite(f.residual[l]) && f.worst[l] > -60.0 && f.log_z[l] < f.top[l] + 10.0;
     }
 };
 

@@ -290,6 +290,7 @@ struct EpLearner {
             }
             for (int i = 0; i < n; i++)
                 for (int j = 0; j < n; j++) a.P[(to + i) * n + j] -= a.x[to + i] * a.x[to + j];
+            for (int i = 0; i < n; i++) a.P[(to + i) * n + i] = max2(a.P[(to + i) * n + i], 0.0);
             for (int i = 0; i < n; i++) a.x[to + i] += a.centre[to + i];
         }
     }
