@@ -30,10 +30,10 @@ OURS = [
     hw.ZonotopeFilter(order=4),
     hw.ZonotopeFilter(order=10),
     hw.ZonotopeFilter(),
-    hw.ConstrainedZonotopeFilter(order=8, constraints=2),
-    hw.ConstrainedZonotopeFilter(order=12, constraints=4),
+    hw.ConstrainedZonotopeFilter(order=8, constraints=1),
     hw.ConstrainedZonotopeFilter(),
-    hw.ConstrainedZonotopeFilter(order=30, constraints=16),
+    hw.ConstrainedZonotopeFilter(order=20, constraints=3, rounds=8),
+    hw.ConstrainedZonotopeFilter(order=20, constraints=6, rounds=16),
 ]
 
 

@@ -20,7 +20,7 @@ using Array = hw::BoxArray;
 using Maybe = hw::MaybeArray;
 using hw::need;
 
-hw::SetSizes sizes(const std::string& kind, std::size_t n, std::size_t m, int generators, int constraints) {
+hw::SetSizes sizes(const std::string& kind, std::size_t n, std::size_t m, int generators, int constraints, int rounds = 0) {
     hw::SetSizes z{};
     if (kind == "interval") z.kind = hw::SetKind::interval;
     else if (kind == "zonotope") z.kind = hw::SetKind::zonotope;
@@ -34,7 +34,9 @@ hw::SetSizes sizes(const std::string& kind, std::size_t n, std::size_t m, int ge
     z.n = static_cast<int>(n);
     z.m = static_cast<int>(m);
     z.generators = generators;
+    need(rounds >= 0, "rounds: not below 0");
     z.constraints = constraints;
+    z.rounds = rounds;
     return z;
 }
 
@@ -55,12 +57,12 @@ nb::object set_start(const std::string& kind, int n, int m, int generators, int 
 }
 
 nb::tuple set_run(const std::string& kind, Maybe E, Array A, Array C, Array bx_lo, Array bx_hi, Array by_lo, Array by_hi,
-                  Array lo, Array hi, Array x, Array state, int generators, int constraints, Maybe bounds_lo,
+                  Array lo, Array hi, Array x, Array state, int generators, int constraints, int rounds, Maybe bounds_lo,
                   Maybe bounds_hi, Maybe E_hi, Maybe A_hi, Maybe C_hi) {
     need(bx_lo.ndim() == 2 && by_lo.ndim() == 2 && lo.ndim() == 1, "bx (T,n), by (T,m), lo (n,) expected");
     const std::size_t T = bx_lo.shape(0), n = bx_lo.shape(1), m = by_lo.shape(1);
     hw::SetRun r{};
-    r.size = sizes(kind, n, m, generators, constraints);
+    r.size = sizes(kind, n, m, generators, constraints, rounds);
     need(by_lo.shape(0) == T && lo.shape(0) == n && hi.size() == n && x.size() == n, "bx (T,n), by (T,m), lo (n,) expected");
     need(bx_hi.size() == T * n && by_hi.size() == T * m, "ends come in pairs");
     need(!bounds_lo == !bounds_hi && (!bounds_lo || (bounds_lo->size() == n && bounds_hi->size() == n)), "bounds (n,) in pairs");
@@ -109,8 +111,8 @@ void bind_sets(nb::module_& mod) {
     mod.def("sets_start", &set_start, "kind"_a, "n"_a, "m"_a, "generators"_a = 0, "constraints"_a = 0,
             "The state of a recursion before its first row.");
     mod.def("sets_run", &set_run, "kind"_a, "E"_a.none(), "A"_a, "C"_a, "bx_lo"_a, "bx_hi"_a, "by_lo"_a, "by_hi"_a, "lo"_a,
-            "hi"_a, "x"_a, "state"_a, "generators"_a = 0, "constraints"_a = 0, "bounds_lo"_a.none() = nb::none(),
-            "bounds_hi"_a.none() = nb::none(), "E_hi"_a.none() = nb::none(), "A_hi"_a.none() = nb::none(),
+            "hi"_a, "x"_a, "state"_a, "generators"_a = 0, "constraints"_a = 0, "rounds"_a = 0,
+            "bounds_lo"_a.none() = nb::none(), "bounds_hi"_a.none() = nb::none(), "E_hi"_a.none() = nb::none(), "A_hi"_a.none() = nb::none(),
             "C_hi"_a.none() = nb::none(),
             "Run the rows E x_t - A x_{t-1} in [bx], C x_t in [by] from the box lo, hi (n,): (lo, hi, x (T+1,n), state, code); code"
             " > 0 is 1 + t (n+m) + i of the first row that contradicts. E, A, C are lower ends if X_hi is given. See core/sets.hpp.");

@@ -25,8 +25,8 @@ struct NoShape {
     bool sound() const { return false; }
 };
 
-// Boxes within this share of the shape's own width along a coordinate are worth a strip.
-constexpr double worth = 0.95;
+// Boxes within this share of the shape's own width along a coordinate are worth a strip, for the rows to come.
+constexpr double worth = 0.7;
 
 template <class Shape>
 std::ptrdiff_t run_sets(const SetRun& r) {
@@ -104,7 +104,6 @@ std::ptrdiff_t run_sets(const SetRun& r) {
                 if (what == Strip::contradicts) bad = 1 + n + last;
             }
             if (folded && !shape.sound()) born = -1.0;
-            if (!bad && folded && born >= 0.0 && !shape.meet(own, own + n)) bad = 1 + n + last;
             if (!bad && born >= 0.0) {
                 shape.reduce();
                 if (!shape.sound()) born = -1.0;

@@ -13,6 +13,7 @@ struct SetSizes {
     int n, m;         // states, outputs
     int generators;   // most generators between rows, n at least
     int constraints;  // most constraints between rows
+    int rounds;       // of the search for their multipliers
 };
 
 struct SetRun {

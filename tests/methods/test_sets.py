@@ -194,7 +194,9 @@ def test_zero_half_widths_give_the_solution_of_the_equations(method):
     lo, hi = hw.estimate(declared, hw.Record(range(6), y), method).check().interval()
     assert np.all((lo <= truth) & (truth <= hi))
     if not isinstance(method, hw.IntervalFilter):
-        assert np.all(hi[2:] - lo[2:] < 1e-6)
+        # multipliers of a few rounds are good to 1e-4; what they leave goes when the first strips are folded in
+        assert np.all(hi[1:] - lo[1:] < 1e-3)
+        assert np.all(hi[3:] - lo[3:] < 1e-6)
 
 
 @EVERY
@@ -244,7 +246,7 @@ def test_more_generators_and_constraints_are_tighter():
             "interval": hw.IntervalFilter(),
             "zonotope": hw.ZonotopeFilter(),
             "few": hw.ConstrainedZonotopeFilter(order=10, constraints=2),
-            "many": hw.ConstrainedZonotopeFilter(order=40, constraints=12),
+            "many": hw.ConstrainedZonotopeFilter(order=40, constraints=12, rounds=30),
             "exact": hw.Hull(memory=10),
         }.items()
     }
@@ -417,3 +419,36 @@ def test_a_nonlinear_stream_equals_its_batch(method):
             live = hw.resume(live.snapshot(), model)
         newest = live.push(record.y[k], u[k])
     np.testing.assert_allclose(newest.interval()[0][0], est.interval()[0][-1], rtol=1e-12)
+
+
+def test_the_default_constrained_zonotope_is_narrower_than_the_zonotope():
+    """Width is what its constraints are for: on each of these systems the mean is well below the zonotope's."""
+    rng = np.random.default_rng(0)
+    narrower = []
+    for seed in range(12):
+        nx, ny = 2 + seed % 3, 1 + seed % 2
+        A = rng.normal(size=(nx, nx))
+        A *= rng.uniform(0.5, 1.0) / np.abs(np.linalg.eigvals(A)).max()
+        q, r = 10 ** rng.uniform(-1.5, -0.5, nx), 10 ** rng.uniform(-1, 0, ny)
+        model = hw.Linear(A, None, rng.normal(size=(ny, nx)), hw.Uniform(q), hw.Uniform(r))
+        model = dataclasses.replace(model, x0=hw.Box(-np.ones(nx), np.ones(nx)))
+        _, record = hw.simulate(model, T=60, seed=seed)
+        widths = []
+        for method in (hw.ConstrainedZonotopeFilter(), hw.ZonotopeFilter()):
+            lo, hi = hw.estimate(model, record, method).check().interval()
+            widths.append(np.mean(hi[5:] - lo[5:]))
+        narrower.append(widths[0] / widths[1])
+    assert max(narrower) <= 1.0
+    assert np.mean(narrower) < 0.95
+
+
+def test_more_rounds_are_tighter_and_one_is_enough_to_contain():
+    truth, record = cornered(OSCILLATOR.model, 300, 7, u=np.zeros((300, 1)))
+    widths = []
+    for rounds in (1, 4, 30):
+        est = hw.estimate(OSCILLATOR.model, record, hw.ConstrainedZonotopeFilter(rounds=rounds))
+        assert contains(est, truth)
+        widths.append(np.mean(np.subtract(*est.interval()[::-1])))
+    assert widths[2] < widths[1] < widths[0]
+    with pytest.raises(hw.BadValue, match="rounds"):
+        hw.ConstrainedZonotopeFilter(rounds=0)

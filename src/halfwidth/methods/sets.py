@@ -3,7 +3,7 @@
 For noise of known half-widths and a box as prior, each row moves a set through the dynamics, adds what the noise can do
 and cuts it with the seen outputs. `IntervalFilter` keeps a box and contracts it forwards and backwards over the newest
 step [1]_; `ZonotopeFilter` keeps generators and the gain that makes them least [2]_; `ConstrainedZonotopeFilter` also
-keeps the newest outputs as constraints, and is exact but for what it forgets [3]_; `EllipsoidFilter` keeps a centre
+keeps the newest outputs as constraints, and can be brought near the exact set [3]_; `EllipsoidFilter` keeps a centre
 and a matrix [4]_. The box runs beside each of the others and both tighten each other, so their answers lie inside that
 of `IntervalFilter`; all lie around the exact hull.
 
@@ -97,7 +97,7 @@ class _Recursion:
             message, hint = hinted(reason)
             raise Refused(message, hint=hint)
         assert isinstance(model.x0, Box)
-        kind, generators, constraints = self._sizes(model)
+        kind, generators, constraints, _ = self._sizes(model)
         shape = _core.sets_start(kind, model.nx, model.ny, generators, constraints)
         return SetState(model.x0.lo, model.x0.hi, model.x0.mean, shape, 0, 0, 0)
 
@@ -111,21 +111,21 @@ class _Recursion:
         """Return the estimate of the newest row, for a stream."""
         return self._estimate(model, state, np.array([t]), state.lo[None], state.hi[None], state.x[None], Labels())
 
-    def _sizes(self, model: Model) -> tuple[str, int, int]:
-        """Return kind of set, most generators and most constraints."""
+    def _sizes(self, model: Model) -> tuple[str, int, int, int]:
+        """Return kind of set, most generators, most constraints, and rounds of the search for their multipliers."""
         raise NotImplementedError
 
     def _advance(
         self, model: Model, state: SetState, rows: Rows, inside: tuple[Array, Array] | None = None
     ) -> tuple[SetState, Array, Array, Array]:
         """Run the kernel over some rows: the state after them, boxes and points of each; `inside` bounds all."""
-        kind, generators, constraints = self._sizes(model)
+        kind, generators, constraints, rounds = self._sizes(model)
         if inside is None and isinstance(model.bounds, Box):
             inside = model.bounds.lo, model.bounds.hi
         low, high = (None, None) if inside is None else inside
         lo, hi, x, shape, code = _core.sets_run(
             kind, rows.E_lo, rows.A_lo, rows.C_lo, rows.bx_lo, rows.bx_hi, rows.by_lo, rows.by_hi, state.lo, state.hi,
-            state.x, state.shape, generators, constraints, low, high, rows.E_hi, rows.A_hi, rows.C_hi,
+            state.x, state.shape, generators, constraints, rounds, low, high, rows.E_hi, rows.A_hi, rows.C_hi,
         )  # fmt: skip
         conflict, which = state.conflict, state.which
         if code and not conflict:
@@ -197,8 +197,8 @@ class IntervalFilter(_Recursion):
     [[0.4, 0.3, 0.2], [1.1, 1.2, 0.7]]
     """
 
-    def _sizes(self, model: Model) -> tuple[str, int, int]:  # noqa: ARG002
-        return "interval", 0, 0
+    def _sizes(self, model: Model) -> tuple[str, int, int, int]:  # noqa: ARG002
+        return "interval", 0, 0, 0
 
 
 @dataclass(frozen=True)
@@ -216,16 +216,17 @@ class ZonotopeFilter(_Recursion):
     def __post_init__(self) -> None:
         _whole(self.order, "order", 1)
 
-    def _sizes(self, model: Model) -> tuple[str, int, int]:
-        return "zonotope", self.order * model.nx, 0
+    def _sizes(self, model: Model) -> tuple[str, int, int, int]:
+        return "zonotope", self.order * model.nx, 0, 0
 
 
 @dataclass(frozen=True)
 class ConstrainedZonotopeFilter(_Recursion):
-    """A zonotope cut by the newest outputs, nearly the exact set.
+    """A zonotope cut by the newest outputs: more settings bring it as near to the exact set as one pays for.
 
     The outputs of the newest rows are kept as constraints; the oldest become part of the generators as in
-    `ZonotopeFilter`. The box of the set comes from small linear programs, whose bounds hold even where they stop early.
+    `ZonotopeFilter`. Each side of the box is a bound by multipliers of the constraints, safe whatever they are; a few
+    rounds of reweighted least squares make them good.
 
     Parameters
     ----------
@@ -233,25 +234,29 @@ class ConstrainedZonotopeFilter(_Recursion):
         Most generators a state between rows.
     constraints : int
         Most outputs kept between rows.
+    rounds : int
+        Rounds of the search for multipliers; 4 are within 3 % of the least box of the same set, 16 within 0.3 %.
     """
 
-    order: int = 20
-    constraints: int = 6
+    order: int = 16
+    constraints: int = 2
+    rounds: int = 4
 
     def __post_init__(self) -> None:
         _whole(self.order, "order", 1)
         _whole(self.constraints, "constraints", 1)
+        _whole(self.rounds, "rounds", 1)
 
-    def _sizes(self, model: Model) -> tuple[str, int, int]:
-        return "constrained", self.order * model.nx, self.constraints
+    def _sizes(self, model: Model) -> tuple[str, int, int, int]:
+        return "constrained", self.order * model.nx, self.constraints, self.rounds
 
 
 @dataclass(frozen=True)
 class EllipsoidFilter(_Recursion):
     """An ellipsoid that contains the state: sums and intersections of least trace, each coordinate in its own width."""
 
-    def _sizes(self, model: Model) -> tuple[str, int, int]:  # noqa: ARG002
-        return "ellipsoid", 0, 0
+    def _sizes(self, model: Model) -> tuple[str, int, int, int]:  # noqa: ARG002
+        return "ellipsoid", 0, 0, 0
 
 
 def _whole(value: object, name: str, least: int) -> None:
