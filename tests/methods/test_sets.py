@@ -430,8 +430,8 @@ def test_the_default_constrained_zonotope_is_narrower_than_the_zonotope():
         A = rng.normal(size=(nx, nx))
         A *= rng.uniform(0.5, 1.0) / np.abs(np.linalg.eigvals(A)).max()
         q, r = 10 ** rng.uniform(-1.5, -0.5, nx), 10 ** rng.uniform(-1, 0, ny)
-        model = hw.Linear(A, None, rng.normal(size=(ny, nx)), hw.Uniform(q), hw.Uniform(r))
-        model = dataclasses.replace(model, x0=hw.Box(-np.ones(nx), np.ones(nx)))
+        C, x0 = rng.normal(size=(ny, nx)), hw.Box(-np.ones(nx), np.ones(nx))
+        model = hw.Linear(A, None, C, hw.Uniform(q), hw.Uniform(r), x0)
         _, record = hw.simulate(model, T=60, seed=seed)
         widths = []
         for method in (hw.ConstrainedZonotopeFilter(), hw.ZonotopeFilter()):
