@@ -3,6 +3,7 @@
     python benchmarks/hull.py                    speed and width beside HiGHS (Codac, ZonoOpt and Qhull: benchmarks/sets.py)
     python benchmarks/hull.py --violations N     N state-steps of simulated truth, counted while they run
     python benchmarks/hull.py --violations N --resume FILE     goes on where FILE stopped, and writes it
+    python benchmarks/hull.py --violations 1e8 --resume FILE --processes 2     the same series, drawn in two processes
 
 A state-step is one entry of one state checked against its box. The noise sits at the corners of its box most of the
 time, 30 % of the outputs are missing, and every series has whole outages. The simulated noise is 1e-12 smaller than the
@@ -10,8 +11,9 @@ half-widths declared, because the simulation itself rounds.
 """
 
 import argparse
-import itertools
+import contextlib
 import json
+import multiprocessing
 import os
 import pathlib
 import sys
@@ -25,7 +27,7 @@ import numpy as np  # noqa: E402
 import halfwidth as hw  # noqa: E402
 
 NAN = np.nan
-EVERY = 30.0  # s between two lines of progress
+BATCH = 256  # series a process draws between two lines of progress
 
 
 def paper003(_):
@@ -85,8 +87,11 @@ def series(model, rng, T):
     x = np.empty((T, model.nx))
     lo, hi = np.maximum(model.x0.lo, -1.0), np.minimum(model.x0.hi, 1.0)
     state = np.where(rng.random(model.nx) < 0.5, lo, hi) if rng.random() < 0.5 else rng.uniform(lo, hi)
+    drive = u @ B.T + w
     for t in range(T):
-        state = np.linalg.solve(E, A @ state + B @ u[t] + w[t])
+        state = A @ state + drive[t]
+        if model.E is not None:
+            state = np.linalg.solve(E, state)
         x[t] = state
     y = np.linalg.solve(F, (x @ C.T + e).T).T
     y[rng.random(y.shape) < 0.3] = NAN
@@ -127,33 +132,44 @@ def declared(model, x, record):
     return hw.Linear(model.A, model.B, model.C, w, e, model.x0, E=model.E, F=model.F, dt=model.dt)
 
 
-def violations(target, path):
-    """Count violations over at least `target` state-steps."""
+def timed(seed):
+    """Run one series; return what it found and the processor time it took."""
+    begin = time.process_time()
+    return *one(seed), time.process_time() - begin
+
+
+@contextlib.contextmanager
+def mapping(processes):
+    """Give a `map` that runs in this process, or in order over several."""
+    if processes == 1:
+        yield map
+    else:
+        with multiprocessing.Pool(processes) as pool:
+            yield pool.imap
+
+
+def violations(target, path, processes=1):
+    """Count violations over at least `target` state-steps: series after series, whoever draws them."""
     total = {"seed": 0, "state_steps": 0, "violations": 0, "loose": 0, "sides": 0, "cpu_s": 0.0, "worst": []}
     if path is not None and path.exists():
         total = json.loads(path.read_text())
         print(f"resumed at {total['state_steps']:,} state-steps")
-    said = time.monotonic()
-    begin, before = time.process_time(), total["cpu_s"]
-    for seed in itertools.count(total["seed"]):
-        if total["state_steps"] >= target:
-            break
-        steps, out, loose, sides, worst = one(seed)
-        total["seed"] = seed + 1
-        total["state_steps"] += steps
-        total["violations"] += out
-        total["loose"] += loose
-        total["sides"] += sides
-        total["cpu_s"] = before + time.process_time() - begin
-        if worst:
-            total["worst"].append(worst)
-            print(worst, flush=True)
-        if time.monotonic() - said > EVERY:
-            said = time.monotonic()
+    with mapping(processes) as run:
+        while total["state_steps"] < target:
+            for steps, out, loose, sides, worst, cpu in run(timed, range(total["seed"], total["seed"] + BATCH * processes)):
+                if total["state_steps"] >= target:  # the last batch ends where the target is met
+                    break
+                total["seed"] += 1
+                total["state_steps"] += steps
+                total["violations"] += out
+                total["loose"] += loose
+                total["sides"] += sides
+                total["cpu_s"] += cpu
+                if worst:
+                    total["worst"].append(worst)
+                    print(worst, flush=True)
             report(total)
             save(path, total)
-    report(total)
-    save(path, total)
     return total["violations"]
 
 
@@ -300,9 +316,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--violations", type=float, metavar="N")
     parser.add_argument("--resume", type=pathlib.Path, metavar="FILE")
+    parser.add_argument("--processes", type=int, default=1, metavar="P")
     given = parser.parse_args([] if pathlib.Path(sys.argv[0]).name != pathlib.Path(__file__).name else None)
     if given.violations is not None:
-        raise SystemExit(1 if violations(given.violations, given.resume) else 0)
+        raise SystemExit(1 if violations(given.violations, given.resume, given.processes) else 0)
     speed()
 
 

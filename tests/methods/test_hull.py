@@ -2,7 +2,10 @@
 
 import dataclasses
 import importlib.util
+import json
 import pathlib
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -105,6 +108,19 @@ def test_no_violation_in_a_hundred_thousand_state_steps():
         seed += 1
     assert wrong == 0
     assert loose <= 1e-3 * sides
+
+
+def test_the_study_counts_the_same_series_in_any_number_of_processes_and_goes_on_where_it_stopped(tmp_path):
+    def study(name, target, processes):
+        command = [sys.executable, ROOT / "benchmarks" / "hull.py", "--violations", target, "--processes", processes]
+        subprocess.run([str(c) for c in (*command, "--resume", tmp_path / name)], check=True, capture_output=True)
+        return {k: v for k, v in json.loads((tmp_path / name).read_text()).items() if k != "cpu_s"}
+
+    alone = study("alone", 2500, 1)
+    assert study("two", 1000, 2)["state_steps"] < 2500
+    assert study("two", 2500, 2) == alone
+    assert alone["seed"] >= 4  # one of each kind at least
+    assert alone["violations"] == 0
 
 
 # ---- solvers that lie --------------------------------------------------------------------------------------------------
