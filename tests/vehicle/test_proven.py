@@ -72,6 +72,18 @@ def test_numbers_that_the_fixes_contradict_are_named():
     assert "no trajectory fits" in words
 
 
+def test_fixes_that_contradict_are_named_where_there_is_no_gap_too():
+    t = np.arange(0, 60, 0.5)
+    fixes = np.column_stack((12.0 * t, 0.0 * t))
+    assert not isinstance(band(t, fixes, 1.0, 0.5), str)
+    fixes[70, 1] += 5.0
+    words = band(t, fixes, 1.0, 0.5)
+    assert isinstance(words, str)
+    assert words.startswith("north: no trajectory fits")
+    assert "t = 35 s" in words
+    assert "grow" in words
+
+
 def test_a_drive_is_inside_and_its_half_widths_are_not_touched(tmp_path):
     truth, log = simulate_drive(seed=3, duration=200.0)
     plain, track = fill(log), fill(log, guaranteed=(4.0, 4.0))
@@ -96,6 +108,9 @@ def test_a_drive_is_inside_and_its_half_widths_are_not_touched(tmp_path):
     assert np.all(np.array(written) >= exact)
     assert np.all(np.array(written) <= exact + 2e-3)
     track.report(tmp_path / "report.html")
+    assert f"guaranteed band, half-width at most {p.half_m.max():.1f} m: holds while" in track.summary()
+    assert len(track.summary().splitlines()) <= 12
+    assert "guaranteed band" not in plain.summary()
     page = (tmp_path / "report.html").read_text()
     assert "Guaranteed band" in page
     assert "within 4 m/s² and every fix within 4 m" in page

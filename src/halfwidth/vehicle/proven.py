@@ -6,7 +6,7 @@ On each axis the position p and the speed v after a step of h seconds, with an a
 
 contain every motion: a is the mean acceleration of the step, and |p' - p - h v - h^2 / 2 a| <= q h^2 / 4 whatever the
 acceleration does inside it. Fixes are within r of the truth, per axis. `Hull` bounds p in and around every gap; a fix
-elsewhere is its own bound. Between two bounded rows, s seconds after the one and s' before the other, p is within
+elsewhere is its own bound, after a cheap set has found no contradiction among all of them. Between two bounded rows, s seconds after the one and s' before the other, p is within
 q s s' / 2 of the chord. Nothing is learnt from the log and no other sensor is used, so the band is as true as the two
 numbers, and far wider than a calibrated one.
 """
@@ -27,9 +27,13 @@ from halfwidth.spread import Box
 
 Floats = NDArray[np.float64]
 
+#: Fixes before one that contradicts which are asked again for the least growth that reconciles them.
+_ASKED = 200
 #: Fixes around a gap that count for it, rows of a gap that are solved for, and what is no gap, s; other rows follow
 #: from their neighbours.
 _CONTEXT, _NODES, _SHORT = 20, 30, 3.0
+
+_AXES = ("east", "north")
 
 #: Columns of the band as a table.
 COLUMNS: tuple[str, ...] = ("proven_west_m", "proven_east_m", "proven_south_m", "proven_north_m")
@@ -125,6 +129,10 @@ def band(t: ArrayLike, fixes: ArrayLike, q: float, r: float) -> tuple[Floats, Fl
         Or, in words, why the log contradicts the two numbers.
     """
     t, fixes = np.asarray(t, dtype=np.float64), np.asarray(fixes, dtype=np.float64)
+    for axis in (0, 1):
+        against = _contradiction(t, fixes[:, axis], q, r)
+        if against is not None:
+            return f"{_AXES[axis]}: {against}"
     lo, hi = np.nextafter(fixes - r, -np.inf), np.nextafter(fixes + r, np.inf)
     seen = np.isfinite(fixes).all(axis=1)
     held = seen.copy()
@@ -134,10 +142,23 @@ def band(t: ArrayLike, fixes: ArrayLike, q: float, r: float) -> tuple[Floats, Fl
         for axis in (0, 1):
             est = estimate(_motion(q, r), Record(t[kept], fixes[kept, axis]), load("Hull")())
             if not est.status.good:
-                return f"{'east' if axis == 0 else 'north'}: {est.message}"
+                return f"{_AXES[axis]}: {est.message}"
             ends = est.interval()
             lo[kept, axis], hi[kept, axis] = ends[0][:, 0], ends[1][:, 0]
     return _between(t, held, lo, hi, q)
+
+
+def _contradiction(t: Floats, fixes: Floats, q: float, r: float) -> str | None:
+    """Return in words which fixes (M,) of one axis no motion explains, wherever the gaps are, or None."""
+    seen = np.isfinite(fixes)
+    t, fixes = t[seen], fixes[seen]
+    est = estimate(_motion(q, r), Record(t, fixes), load("ConstrainedZonotopeFilter")())
+    if est.status.good:
+        return None
+    last = est.info["conflict"][0]["row"] + 1
+    part = slice(max(0, last - _ASKED), last)
+    exact = estimate(_motion(q, r), Record(t[part], fixes[part]), load("Hull")())
+    return est.message if exact.status.good else exact.message
 
 
 def _motion(q: float, r: float) -> Linear:

@@ -317,9 +317,13 @@ class Track:
             "  " + ", ".join(f"{count} {name}" for name, count in rows.items() if count),
             f"  half-widths at level {self.level:g}, {GUARANTEES[self.guarantee]}",
         ]
+        if self.proven is not None:
+            half = self.proven.half_m
+            wide = f"at most {half.max():.1f} m" if np.isfinite(half).all() else "without end in places"
+            lines.append(f"  guaranteed band, half-width {wide}: {self.proven.words}")
         if self.gaps:
             lines.append("  gap         from s      to s   length s  distance m  half-width m")
-            shown = sorted(self.gaps, key=lambda gap: -gap.max_half_m)[:7]
+            shown = sorted(self.gaps, key=lambda gap: -gap.max_half_m)[: 7 - (self.proven is not None)]
             lines += [
                 f"  {gap.quality:<12}{gap.start:>7.1f}{gap.stop:>10.1f}{gap.duration_s:>11.1f}"
                 f"{gap.distance_m:>12.0f}{gap.max_half_m:>14.2f}"
