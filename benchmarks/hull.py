@@ -156,7 +156,9 @@ def violations(target, path, processes=1):
         print(f"resumed at {total['state_steps']:,} state-steps")
     with mapping(processes) as run:
         while total["state_steps"] < target:
-            for steps, out, loose, sides, worst, cpu in run(timed, range(total["seed"], total["seed"] + BATCH * processes)):
+            for steps, out, loose, sides, worst, cpu in run(
+                timed, range(total["seed"], total["seed"] + BATCH * processes)
+            ):
                 if total["state_steps"] >= target:  # the last batch ends where the target is met
                     break
                 total["seed"] += 1
