@@ -5,11 +5,11 @@ On each axis the position p and the speed v after a step of h seconds, with an a
     v' = v + h a,    p' = p + h v + h^2 / 2 a + h^2 / 4 b,    |a| <= q, |b| <= q,
 
 contain every motion: a is the mean acceleration of the step, and |p' - p - h v - h^2 / 2 a| <= q h^2 / 4 whatever the
-acceleration does inside it. Fixes are within r of the truth, per axis. A cheap set goes over all fixes first, since where
-they contradict the two numbers there is no band. `Hull` bounds p in and around every gap; a fix elsewhere is its own bound.
-Between two bounded rows, s seconds after the one and s' before the other, p is within q s s' / 2 of the chord. Nothing is
-learnt from the log and no other sensor is used, so the band is as true as the two numbers, and far wider than a calibrated
-one.
+acceleration does inside it. Fixes are within r of the truth, per axis. A cheap set goes over all fixes first, since
+where they contradict the two numbers there is no band. `Hull` bounds p in and around every gap; a fix elsewhere is
+its own bound. Between two bounded rows, s seconds after the one and s' before the other, p is within q s s' / 2 of
+the chord. Nothing is learnt from the log and no other sensor is used, so the band is as true as the two numbers, and
+far wider than a calibrated one.
 """
 
 from dataclasses import dataclass
