@@ -35,37 +35,47 @@ constexpr double lp_inf = 1e300;     // bounds at or beyond this are absent
 constexpr double lp_warm_gap = 0.1;  // relative gap of the iterate that the next window starts from
 constexpr double lp_pinned = 1e100;  // added to the diagonal of a variable that must not move
 
-// The sizes that are compiled for: n alone (0: not even that), or n and m of a plain program, which has no theta, no E,
-// no slacks and as many half-widths as kinds of rows.
-template <int N, int Y>
+// The sizes that are compiled for: n alone (0: not even that), or all of a plain program, which has no theta, no E, no
+// slacks and a half-width of its own for every kind of row; boxes on its states or none.
+template <int N, int Y, bool Boxed>
 struct Shape {
     static constexpr int m = Y, rows = N + Y, p0 = 0, ns = N + Y, p = N + Y;
-    static constexpr bool soft = false, unit_E = true;
+    static constexpr bool soft = false, unit_E = true, boxed = Boxed;
+    static constexpr int G = rows + (Boxed ? N : 0);      // pairs a state: rows, then boxes
+    static constexpr std::ptrdiff_t pw = 2 * G;           // pair entries a state: 2 G, then a slack a row
+    static constexpr std::ptrdiff_t zq = N * (N + p);     // entries of Z a state
     explicit Shape(const LpProblem&) {}
+    static int kind(int j) { return j; }
     static bool fits(const LpProblem& lp) {
-        return lp.n == N && lp.m == Y && lp.ns == N + Y && lp.p0 == 0 && !lp.E && !lp.slack;
+        bool own = lp.ns == N + Y;
+        for (int j = 0; own && j < N + Y; j++) own = lp.group[j] == j;
+        return own && lp.n == N && lp.m == Y && lp.p0 == 0 && !lp.E && !lp.slack && Boxed == (lp.lo || lp.x0_lo);
     }
 };
 template <int N>
-struct Shape<N, 0> {
+struct Shape<N, 0, false> {
     const int m, rows, p0, ns, p;  // p = p0 + ns border columns
-    const bool soft, unit_E;
+    const bool soft, unit_E, boxed;
+    const int G;
+    const std::ptrdiff_t pw, zq;
+    const int* const group;
     explicit Shape(const LpProblem& lp)
-        : m(lp.m), rows(lp.n + lp.m), p0(lp.p0), ns(lp.ns), p(lp.p0 + lp.ns), soft(lp.slack), unit_E(!lp.E) {}
+        : m(lp.m), rows(lp.n + lp.m), p0(lp.p0), ns(lp.ns), p(lp.p0 + lp.ns), soft(lp.slack), unit_E(!lp.E),
+          boxed(lp.lo || lp.x0_lo), G(rows + (boxed ? lp.n : 0)), pw(2 * G + (soft ? rows : 0)),
+          zq(std::ptrdiff_t(lp.n) * (lp.n + p)), group(lp.group) {}
+    int kind(int j) const { return group[j]; }
 };
 
-template <int P, int N, int Y>
-struct BandedIpm : Shape<N, Y> {
+template <int P, int N, int Y = 0, bool Boxed = false>
+struct BandedIpm : Shape<N, Y, Boxed> {
     using V = Lanes<P>;
     using I = std::ptrdiff_t;
-    using Size = Shape<N, Y>;
-    using Size::m, Size::rows, Size::p0, Size::ns, Size::p, Size::soft, Size::unit_E;
+    using Size = Shape<N, Y, Boxed>;
+    using Size::m, Size::rows, Size::p0, Size::ns, Size::p, Size::soft, Size::unit_E, Size::boxed, Size::G, Size::pw,
+        Size::zq, Size::kind;
     const LpProblem& lp;
     const LpSettings& set;
     Dim<N> n;
-    const bool boxed;
-    const int G;  // pairs a state: rows, then boxes
-    const I pw, zq;  // pair entries a state: 2 G, then a slack a row; entries of Z a state
     const int H;
     bool capped;
 
@@ -74,6 +84,7 @@ struct BandedIpm : Shape<N, Y> {
     I dE, dA, dC;
     // iterate, directions, the reference that b is relative to, the best iterate so far
     V *x, *w, *l, *u, *v, *dx, *px, *xref, *xbest, *lbest, *wbest, *xwarm, *lwarm;
+    V* inv;  // 1 / (w l), and 0 where there is no row: whatever is multiplied by it leaves such a pair out
     // factor and right-hand side
     V *L, *O, *Z, *f, *Q, *K, *acc, *zacc;
     // one state's worth of scratch
@@ -85,8 +96,7 @@ struct BandedIpm : Shape<N, Y> {
     double objective, comp, dinf, pinf, dual;  // of the current iterate, set by `assemble`
 
     BandedIpm(const LpProblem& lp_, const LpSettings& set_)
-        : Size(lp_), lp(lp_), set(set_), n(lp_.n), boxed(lp_.lo || lp_.x0_lo), G(rows + (boxed ? int(n) : 0)),
-          pw(2 * G + (soft ? rows : 0)), zq(I(n) * (n + p)), H((lp_.T + P) / P) {
+        : Size(lp_), lp(lp_), set(set_), n(lp_.n), H((lp_.T + P) / P) {
         dE = lp.E_t ? n * n : 0;
         dA = lp.A_t ? n * n : 0;
         dC = lp.C_t ? m * n : 0;
@@ -106,7 +116,7 @@ struct BandedIpm : Shape<N, Y> {
         xlo = c.take<V>(boxed ? h * n : 0);
         xhi = c.take<V>(boxed ? h * n : 0);
         c.many(h * n, x, dx, xref, xbest, f, px);
-        c.many(h * pw, w, l, u, v, lbest);
+        c.many(h * pw, w, l, u, v, inv, lbest);
         wbest = c.take<V>(soft ? h * pw : 0);
         xwarm = c.take<V>(set.warm ? h * n : 0);
         lwarm = c.take<V>(set.warm ? h * pw : 0);
@@ -180,9 +190,9 @@ struct BandedIpm : Shape<N, Y> {
     }
 
     // weights of row or box j at place i: W on (rho,rho), Sj on (rho,s), Wsj on (s,s); a slack is eliminated here
-    inline void weigh(const V* wi, const V* li, int j, V& Wj, V& Sj, V& Wsj) const {
+    inline void weigh(I i, int j, V& Wj, V& Sj, V& Wsj) const {
         V Wd, Sd, de;
-        slopes(wi, li, j, Wd, Sd, de);
+        slopes(i, j, Wd, Sd, de);
         Wj = Wsj = Wd;
         Sj = Sd;
         if (soft && j < rows) {
@@ -194,21 +204,18 @@ struct BandedIpm : Shape<N, Y> {
     }
 
     // d = l / w of a pair, as sum and difference, and of its slack
-    inline void slopes(const V* wi, const V* li, int j, V& Wd, V& Sd, V& de) const {
-        const V dp = li[2 * j] / wi[2 * j], dm = li[2 * j + 1] / wi[2 * j + 1];
+    inline void slopes(I i, int j, V& Wd, V& Sd, V& de) const {
+        const V dp = slope(i * pw + 2 * j), dm = slope(i * pw + 2 * j + 1);
         Wd = dp + dm;
         Sd = dm - dp;
-        de = soft && j < rows ? li[2 * G + j] / wi[2 * G + j] : V(0.0);
+        de = soft && j < rows ? slope(i * pw + 2 * G + j) : V(0.0);
     }
+    inline V slope(I k) const { return l[k] * (l[k] * inv[k]); }
 
     // ---- forward: assemble and factor -----------------------------------------------------------------------------
 
-    // Take the step (ap, ad) along (u, v), measure the new iterate, and factor Newton's matrix there.
-    void assemble(double ap, double ad, bool step, bool measure) {
-        const I nn = I(n) * n;
-        const int q = n + p;
-        for (int c = 0; c < tri(q, 0); c++) Q[c] = V(0.0);
-        for (int c = 0; c < p * p; c++) K[c] = V(0.0);
+    // Take the step (ap, ad) along (u, v) and measure the new iterate.
+    void advance(double ap, double ad, bool step) {
         for (int c = 0; c < p; c++) zacc[c] = V(0.0);
         V gap_sum(0.0), res_sum(0.0), dual_sum(0.0), slack_sum(0.0);
         const V a_p(ap), a_d(ad);
@@ -222,27 +229,42 @@ struct BandedIpm : Shape<N, Y> {
                 }
                 for (int k = 0; k < n; k++) xi[k] += a_p * dx[i * n + k];
             }
-            if (measure) {
-                for (I k = 0; k < pw; k++) gap_sum += wi[k] * li[k];
-                for (int j = 0; j < G; j++) nu[j] = li[2 * j] - li[2 * j + 1];
-                adjoint(i, nu, own, bef, true);
-                if (i > 0) res_sum += residual_of(i - 1, bef);
-                else for (int k = 0; k < n; k++) bef0[k] = bef[k];
-                for (int k = 0; k < n; k++) dres[k] = own[k];
-                for (int j = 0; j < rows; j++) zacc[p0 + lp.group[j]] += li[2 * j] + li[2 * j + 1];
-                if (capped) {
-                    for (int j = 0; j < rows; j++) dual_sum -= b[i * rows + j] * nu[j];
-                    if (boxed)
-                        for (int k = 0; k < n; k++) {
-                            const int j = 2 * (rows + k);  // bounds are x + w+ above and x - w- below
-                            dual_sum += li[j + 1] * (xi[k] - wi[j + 1]) - li[j] * (xi[k] + wi[j]);
-                        }
-                }
-                if (soft)
-                    for (int j = 0; j < rows; j++)
-                        slack_sum += where_positive(li[2 * G + j], V(lp.slack[j] / kappa[j]) * wi[2 * G + j], V(0.0));
+            for (I k = 0; k < pw; k++) gap_sum += wi[k] * li[k];
+            for (int j = 0; j < G; j++) nu[j] = li[2 * j] - li[2 * j + 1];
+            adjoint(i, nu, own, bef, true);
+            if (i > 0) res_sum += residual_of(i - 1, bef);
+            else for (int k = 0; k < n; k++) bef0[k] = bef[k];
+            for (int k = 0; k < n; k++) dres[k] = own[k];
+            for (int j = 0; j < rows; j++) zacc[p0 + kind(j)] += li[2 * j] + li[2 * j + 1];
+            if (capped) {
+                for (int j = 0; j < rows; j++) dual_sum -= b[i * rows + j] * nu[j];
+                if (boxed)
+                    for (int k = 0; k < n; k++) {
+                        const int j = 2 * (rows + k);  // bounds are x + w+ above and x - w- below
+                        dual_sum += li[j + 1] * (xi[k] - wi[j + 1]) - li[j] * (xi[k] + wi[j]);
+                    }
             }
-            for (int j = 0; j < G; j++) weigh(wi, li, j, W[j], Sg[j], Ws[j]);
+            if (soft)
+                for (int j = 0; j < rows; j++)
+                    slack_sum += where_positive(li[2 * G + j], V(lp.slack[j] / kappa[j]) * wi[2 * G + j], V(0.0));
+        }
+        for (int k = 0; k < n; k++) bef[k] = from_after(bef0[k]);
+        res_sum += residual_of(H - 1, bef);
+        measure_dense(sum_lanes(gap_sum), sum_lanes(res_sum), sum_lanes(dual_sum), sum_lanes(slack_sum));
+    }
+
+    // Newton's matrix at the iterate, factored.
+    void assemble() {
+        const I nn = I(n) * n;
+        const int q = n + p;
+        for (int c = 0; c < tri(q, 0); c++) Q[c] = V(0.0);
+        for (int c = 0; c < p * p; c++) K[c] = V(0.0);
+        for (I i = 0; i < H; i++) {
+            for (I k = i * pw; k < (i + 1) * pw; k++) {
+                const V product = w[k] * l[k];
+                inv[k] = where_positive(product - V(1e-290), V(1.0) / product, V(0.0));
+            }
+            for (int j = 0; j < G; j++) weigh(i, j, W[j], Sg[j], Ws[j]);
             blocks(i);
             if (i > 0) {
                 V *Lb = L + (i - 1) * nn, *Zb = Z + (i - 1) * zq;
@@ -255,17 +277,7 @@ struct BandedIpm : Shape<N, Y> {
                 for (int k = 0; k < n * p; k++) Bb0[k] = Bb[k];
             }
         }
-        if (measure) {
-            for (int k = 0; k < n; k++) bef[k] = from_after(bef0[k]);
-            res_sum += residual_of(H - 1, bef);
-            measure_dense(sum_lanes(gap_sum), sum_lanes(res_sum), sum_lanes(dual_sum), sum_lanes(slack_sum));
-        }
         separators();
-    }
-
-    // a / (w l) of a pair, 0 where there is no row
-    static inline V share(const V& a, const V& w_, const V& l_) {
-        return where_positive(l_, a / (w_ * where_positive(l_, l_, V(1.0))), V(0.0));
     }
 
     inline V residual_of(I i, const V* after) const {
@@ -323,7 +335,7 @@ struct BandedIpm : Shape<N, Y> {
                 for (int d = 0; d <= c; d++) K[c * p + d] += wg * g[j * p0 + d];
             }
         for (int j = 0; j < n; j++) {
-            const int s = p0 + lp.group[j];
+            const int s = p0 + kind(j);
             for (int k = 0; k < n; k++) {
                 if (unit_E) {
                     if (k == j) B[s * n + k] += Ed[k] * Sg[j];
@@ -334,9 +346,9 @@ struct BandedIpm : Shape<N, Y> {
             }
         }
         for (int j = 0; j < m; j++)
-            for (int k = 0; k < n; k++) B[(p0 + lp.group[n + j]) * n + k] += Ci[j * n + k] * Sg[n + j];
+            for (int k = 0; k < n; k++) B[(p0 + kind(n + j)) * n + k] += Ci[j * n + k] * Sg[n + j];
         for (int j = 0; j < rows; j++) {
-            const int s = p0 + lp.group[j];
+            const int s = p0 + kind(j);
             K[s * p + s] += Ws[j];
             for (int c = 0; c < p0; c++) K[s * p + c] += Sg[j] * g[j * p0 + c];
         }
@@ -406,7 +418,7 @@ struct BandedIpm : Shape<N, Y> {
             for (int j = 0; j < G; j++) {
                 V t(0.0);
                 row(i, j, nu[j], t);
-                if (j < rows) zacc[p0 + lp.group[j]] += t;
+                if (j < rows) zacc[p0 + kind(j)] += t;
             }
             adjoint(i, nu, own, bef, true);
             V* fi = f + i * n;
@@ -473,7 +485,7 @@ struct BandedIpm : Shape<N, Y> {
             zhi[p0 + c] = lp.cap[c] >= lp_inf ? 2 * lp_inf : lp.cap[c] / sz[p0 + c];
             zref[p0 + c] = 0.0;
         }
-        for (int j = 0; j < rows; j++) kappa[j] = 1.0 / (lp.h[j] * sz[p0 + lp.group[j]]);
+        for (int j = 0; j < rows; j++) kappa[j] = 1.0 / (lp.h[j] * sz[p0 + kind(j)]);
         for (int j = 0; j < m; j++) {  // share of the rows in which an output is seen
             int c = 0;
             for (I t = 0; t < T; t++) c += lp.seen[t * m + j];
@@ -595,7 +607,7 @@ struct BandedIpm : Shape<N, Y> {
     void least_squares() {
         reg = 1e-8;
         for (int k = 0; k < 2 * p; k++) zw[k] = 1.0, zl[k] = 0.0;
-        assemble(0, 0, false, false);
+        assemble();
         forward([&](I i, int j, V& nu_, V&) { nu_ = j < rows ? -b[i * rows + j] : V(0.0); });
         backward(false, dx, dz, [](I, const V*, const V*) {});
         recentre();
@@ -647,7 +659,7 @@ struct BandedIpm : Shape<N, Y> {
         V sum(0.0);
         for (I i = 0; i < H; i++)
             for (int j = 0; j < rows; j++) {
-                const double s = z[p0 + lp.group[j]], lam = kz[p0 + lp.group[j]];
+                const double s = z[p0 + kind(j)], lam = kz[p0 + kind(j)];
                 V *wi = w + i * pw + 2 * j, *li = l + i * pw + 2 * j;
                 const V on = li[0], rj = -b[i * rows + j];
                 V ws(s);
@@ -705,7 +717,7 @@ struct BandedIpm : Shape<N, Y> {
     bool rows_of(int c, double& top, double& number) {
         top = number = 0.0;
         for (int j = 0; j < rows; j++)
-            if (lp.group[j] == c) top = max2(top, hmax[j] / S), number += count[j];
+            if (kind(j) == c) top = max2(top, hmax[j] / S), number += count[j];
         if (number == 0.0) z[p0 + c] = zhi[p0 + c] = zlo[p0 + c];
         return number > 0.0;
     }
@@ -801,14 +813,14 @@ struct BandedIpm : Shape<N, Y> {
         }
         for (I k = max2(I(1), from.T - from.drop + 1); k <= lp.T; k++)  // room for the new rows
             for (int j = 0; j < rows; j++) {
-                double& zj = z[p0 + lp.group[j]];
+                double& zj = z[p0 + kind(j)];
                 zj = max2(zj, 1.2 * std::fabs(b[k % H * rows + j][k / H]) + 1e-3);
             }
         double sum = 0.0, known = 0.0;
         for (I i = 0; i < H; i++)
             for (int j = 0; j < rows; j++) {
                 V *wi = w + i * pw + 2 * j, *li = l + i * pw + 2 * j;
-                const V on = li[0], rj = -b[i * rows + j], s(z[p0 + lp.group[j]]);
+                const V on = li[0], rj = -b[i * rows + j], s(z[p0 + kind(j)]);
                 wi[0] = where_positive(on, s - rj, V(1.0));
                 wi[1] = where_positive(on, s + rj, V(1.0));
                 for (int t = 0; t < P; t++) {
@@ -918,9 +930,9 @@ struct BandedIpm : Shape<N, Y> {
     }
 
     // the slack's own step at row j: de = (t - Wd ds - Sd drho) / (Wd + de)
-    inline V slack_step(const V* wi, const V* li, int j, const V& t, const V& ds, const V& drho) const {
+    inline V slack_step(I i, int j, const V& t, const V& ds, const V& drho) const {
         V Wd, Sd, de;
-        slopes(wi, li, j, Wd, Sd, de);
+        slopes(i, j, Wd, Sd, de);
         return (t - Wd * ds - Sd * drho) * (V(1.0) / larger(Wd + de, V(1e-300)));
     }
 
@@ -934,13 +946,13 @@ struct BandedIpm : Shape<N, Y> {
     template <class AskFn>
     void ask(AskFn e) {
         forward([&](I i, int j, V& nu_, V& t) {
-            const V *wi = w + i * pw, *li = l + i * pw;
+            const V* li = l + i * pw;
             const V zp = li[2 * j] * e(i, 2 * j), zm = li[2 * j + 1] * e(i, 2 * j + 1);
             nu_ = zp - zm;
             t = zp + zm;
             if (soft && j < rows) {
                 V Wd, Sd, de;
-                slopes(wi, li, j, Wd, Sd, de);
+                slopes(i, j, Wd, Sd, de);
                 const V own_ = slack_rhs(li, j, t + li[2 * G + j] * e(i, 2 * G + j)) * (V(1.0) / larger(Wd + de, V(1e-300)));
                 nu_ += Sd * own_;
                 t -= Wd * own_;
@@ -953,13 +965,13 @@ struct BandedIpm : Shape<N, Y> {
     template <class AskFn, class TakeFn>
     void answer(bool zero_rhs, AskFn e, TakeFn take) {
         backward(zero_rhs, dx, dz, [&](I i, const V* xi, const V* xb) {
-            const V *wi = w + i * pw, *li = l + i * pw;
+            const V* li = l + i * pw;
             apply(i, xi, xb, p0 ? dzv : nullptr, rho);
             for (int j = 0; j < G; j++) {
-                V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
+                V ds = j < rows ? dzv[p0 + kind(j)] : V(0.0);
                 if (soft && j < rows) {
                     const V asked = li[2 * j] * e(i, 2 * j) + li[2 * j + 1] * e(i, 2 * j + 1) + li[2 * G + j] * e(i, 2 * G + j);
-                    const V de = slack_step(wi, li, j, slack_rhs(li, j, asked), ds, rho[j]);
+                    const V de = slack_step(i, j, slack_rhs(li, j, asked), ds, rho[j]);
                     take(i, 2 * G + j, de);
                     ds += de;
                 }
@@ -982,10 +994,10 @@ struct BandedIpm : Shape<N, Y> {
         V block_p(0.0), block_d(0.0), Su(0.0), Suu(0.0);
         answer(!soft, none, [&](I i, I k_, const V& dw) {
             const I k = i * pw + k_;
-            const V a = where_positive(l[k], dw / w[k], V(0.0)), wl = w[k] * l[k];
+            const V a = dw * (l[k] * inv[k]), wl = w[k] * l[k];
             u[k] = a;
             block_p = larger(block_p, -a);
-            block_d = larger(block_d, where_positive(l[k], V(1.0) + a, V(0.0)));
+            block_d = larger(block_d, V(1.0) + a);
             Su += wl * a;
             Suu += wl * a * a;
         });
@@ -1007,7 +1019,7 @@ struct BandedIpm : Shape<N, Y> {
         V block_p(0.0), block_d(0.0);
         answer(false, [&](I i, I k) { return v[i * pw + k]; }, [&](I i, I k_, const V& dw) {
             const I k = i * pw + k_;
-            const V un = where_positive(l[k], dw / w[k], V(0.0)), vn = where_positive(l[k], v[k] - V(1.0) - un, V(0.0));
+            const V un = dw * (l[k] * inv[k]), vn = where_positive(l[k], v[k] - V(1.0) - un, V(0.0));
             u[k] = un;
             v[k] = vn;
             block_p = larger(block_p, -un);
@@ -1025,7 +1037,7 @@ struct BandedIpm : Shape<N, Y> {
             if (zl[k] > 0) ze[k] = target_ / (zw[k] * zl[k]) - zu[k] * zv[k];
         ask([&](I i, I k_) {
             const I k = i * pw + k_;
-            return v[k] = share(target, w[k], l[k]) + u[k] * (V(1.0) + u[k]);
+            return v[k] = target * inv[k] + u[k] * (V(1.0) + u[k]);
         });
         direction(block_p, block_d);
     }
@@ -1055,12 +1067,11 @@ struct BandedIpm : Shape<N, Y> {
             for (I k = 0; k < I(H) * n; k++) px[k] = step ? f[k] + V(beta) * px[k] : f[k];
             for (int k = 0; k < n; k++) left[k] = from_before(px[(H - 1) * n + k]);
             for (I i = 0; i < H; i++) {
-                const V *wi = w + i * pw, *li = l + i * pw;
                 apply(i, px + i * n, i ? px + (i - 1) * n : left, p0 ? dzv : nullptr, rho);
                 for (int j = 0; j < G; j++) {
-                    const V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
+                    const V ds = j < rows ? dzv[p0 + kind(j)] : V(0.0);
                     V Wj, Sj, Wsj;
-                    weigh(wi, li, j, Wj, Sj, Wsj);
+                    weigh(i, j, Wj, Sj, Wsj);
                     energy += Wj * rho[j] * rho[j] + V(2.0) * Sj * rho[j] * ds + Wsj * ds * ds;
                 }
             }
@@ -1077,19 +1088,19 @@ struct BandedIpm : Shape<N, Y> {
         V block_p(0.0), block_d(0.0);
         const V g(gamma);
         for (I i = 0; i < H; i++) {
-            V *wi = w + i * pw, *li = l + i * pw, *ui = u + i * pw, *vi = v + i * pw;
+            V *li = l + i * pw, *ui = u + i * pw, *vi = v + i * pw;
             apply(i, px + i * n, i ? px + (i - 1) * n : left, p0 ? dzv : nullptr, rho);
             auto take = [&](const V& dw, int k) {
-                const V du = where_positive(li[k], g * dw / wi[k], V(0.0));
+                const V du = g * dw * (li[k] * inv[i * pw + k]);
                 ui[k] += du;
                 vi[k] -= du;
                 block_p = larger(block_p, -ui[k]);
                 block_d = larger(block_d, -vi[k]);
             };
             for (int j = 0; j < G; j++) {
-                V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
+                V ds = j < rows ? dzv[p0 + kind(j)] : V(0.0);
                 if (soft && j < rows) {
-                    const V de = slack_step(wi, li, j, V(0.0), ds, rho[j]);
+                    const V de = slack_step(i, j, V(0.0), ds, rho[j]);
                     take(de, 2 * G + j);
                     ds += de;
                 }
@@ -1188,7 +1199,7 @@ struct BandedIpm : Shape<N, Y> {
         bool kept = false, step = false;
         for (;; it++) {
             if (step) dense_take(ap, ad);
-            assemble(ap, ad, step, true);
+            advance(ap, ad, step);
             step = true;
             const double size = std::fabs(objective) + 1e-6 + free_cost + (set.point == lp_central ? 0.0 : rounding / set.tol);
             const double slip = (dinf - promised) / size;  // what the last direction's dual residual lacks
@@ -1229,6 +1240,7 @@ struct BandedIpm : Shape<N, Y> {
                 return info.status = lp_infeasible;
             }
             if (it >= set.max_iter || !(merit < 1e4 * best || it < 10) || (since >= 8 && best < 1e-5) || since >= 30) break;
+            assemble();
             const double mu = comp / mu_pairs;
             double mu_affine;
             affine(ap, ad, mu_affine);
@@ -1309,7 +1321,7 @@ struct BandedIpm : Shape<N, Y> {
                     }
                 }
                 for (int c = 0; c < p0; c++) r += lp.G[(t * rows + j) * p0 + c] * out.theta[c];
-                const int g = lp.group[j];
+                const int g = kind(j);
                 const double a = std::fabs(r) / lp.h[j];
                 if (grow) {
                     out.s[g] = max2(out.s[g], a);
