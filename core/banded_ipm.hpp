@@ -90,7 +90,7 @@ struct BandedIpm : Shape<N, Y, Boxed> {
     // one state's worth of scratch
     V *W, *Sg, *Ws, *nu, *rho, *own, *bef, *bef0, *back, *back0, *Bb, *Bb0, *wk, *dres, *lz, *left, *dzv;
     // the dense end: z = (theta, s), its bounds as pairs, its Schur complement, the chain of separators
-    double *sx, *kappa, *cz, *sz, *z, *dz, *zref, *kz, *zbest, *zlo, *zhi, *zw, *zl, *zu, *zv, *ze, *zrp, *zlbest, *zwarm, *zlwarm;
+    double *sx, *kappa, *cz, *sz, *z, *dz, *zref, *kz, *zbest, *zlo, *zhi, *zw, *zl, *zu, *zv, *ze, *zrp, *zinv, *zlbest, *zwarm, *zlwarm;
     double *Kd, *KL, *Kpiv, *Kinv, *Korig, *zcg, *pz, *rM, *rO, *rZ, *rQ, *rf, *rx, *racc, *rw, *hmax, *count;
     double S, reg, drop, mu_pairs, rounding;  // what the largest state leaves of a residual, in units S
     double objective, comp, dinf, pinf, dual;  // of the current iterate, set by `assemble`
@@ -135,7 +135,7 @@ struct BandedIpm : Shape<N, Y, Boxed> {
         sx = c.take<double>(n);
         c.many(rows, kappa, hmax, count);
         c.many(p, cz, sz, z, dz, zref, kz, zbest, zlo, zhi, Kpiv, Kinv, racc, Korig, zcg, pz, zwarm);
-        c.many(2 * p, zw, zl, zu, zv, ze, zrp, zlbest, zlwarm);
+        c.many(2 * p, zw, zl, zu, zv, ze, zrp, zinv, zlbest, zlwarm);
         c.many(I(p) * p, Kd, KL);
         c.many(P * nn, rM, rO);
         rZ = c.take<double>(I(P) * n * p);
@@ -253,17 +253,22 @@ struct BandedIpm : Shape<N, Y, Boxed> {
         measure_dense(sum_lanes(gap_sum), sum_lanes(res_sum), sum_lanes(dual_sum), sum_lanes(slack_sum));
     }
 
+    inline void invert(I i) {
+        for (I k = i * pw; k < (i + 1) * pw; k++) {
+            const V product = w[k] * l[k];
+            inv[k] = where_positive(product - V(1e-290), V(1.0) / product, V(0.0));
+        }
+    }
+
     // Newton's matrix at the iterate, factored.
     void assemble() {
         const I nn = I(n) * n;
         const int q = n + p;
         for (int c = 0; c < tri(q, 0); c++) Q[c] = V(0.0);
         for (int c = 0; c < p * p; c++) K[c] = V(0.0);
+        invert(0);
         for (I i = 0; i < H; i++) {
-            for (I k = i * pw; k < (i + 1) * pw; k++) {
-                const V product = w[k] * l[k];
-                inv[k] = where_positive(product - V(1e-290), V(1.0) / product, V(0.0));
-            }
+            if (i + 1 < H) invert(i + 1);  // ahead of its use: divisions are slow, and nothing here waits for these
             for (int j = 0; j < G; j++) weigh(i, j, W[j], Sg[j], Ws[j]);
             blocks(i);
             if (i > 0) {
@@ -373,19 +378,22 @@ struct BandedIpm : Shape<N, Y, Boxed> {
             }
         for (int c = 0; c < tri(p, 0); c++) rQ[c] = 0.0;
         chain_factor(n, P, p, rM, rO, rZ, rQ, drop, rw);
+        for (int k = 0; k < 2 * p; k++) zinv[k] = zl[k] > 0 ? 1.0 / (zw[k] * zl[k]) : 0.0;
         for (int c = 0; c < p; c++)
             for (int d = 0; d <= c; d++) {
                 double s = sum_lanes(K[c * p + d] - Q[tri(n + c, n + d)]) - rQ[tri(c, d)];
                 if (c == d) {
                     Korig[c] = sum_lanes(K[c * p + c]);
                     s += reg;
-                    s += zl[2 * c] / zw[2 * c] + zl[2 * c + 1] / zw[2 * c + 1];
+                    s += zslope(2 * c) + zslope(2 * c + 1);
                     if (zhi[c] == zlo[c]) s += lp_pinned;
                 }
                 Kd[c * p + d] = Kd[d * p + c] = s;
             }
         dense_factor();
     }
+
+    double zslope(int k) const { return zl[k] * (zl[k] * zinv[k]); }
 
     // Kd = L D L' of the corner. A pivot lost to rounding is held at what rounding leaves of its diagonal entry: its
     // half-width then moves too little, never too far.
@@ -809,7 +817,7 @@ struct BandedIpm : Shape<N, Y, Boxed> {
         for (int c = 0; c < p; c++) z[c] = 0.0;
         for (int c = 0; c < ns; c++) {
             double top_c, n_c;
-            if (rows_of(c, top_c, n_c)) z[p0 + c] = max2(max2(from.s[c] / (sz[p0 + c] * S), (1 + 1e-9) * top_c), zlo[p0 + c] + 1e-6);
+            if (rows_of(c, top_c, n_c)) z[p0 + c] = max2(max2(1.05 * from.s[c] / (sz[p0 + c] * S), (1 + 1e-9) * top_c), zlo[p0 + c] + 1e-6);
         }
         for (I k = max2(I(1), from.T - from.drop + 1); k <= lp.T; k++)  // room for the new rows
             for (int j = 0; j < rows; j++) {
@@ -916,13 +924,13 @@ struct BandedIpm : Shape<N, Y, Boxed> {
     // asked beyond it goes into the right-hand side as l e.
     void dense_rhs() {
         for (int k = 0; k < 2 * p; k++)
-            if (zl[k] > 0) kz[k / 2] += (k & 1 ? -1.0 : 1.0) * zl[k] * (ze[k] - zrp[k] / zw[k]);
+            kz[k / 2] += (k & 1 ? -1.0 : 1.0) * zl[k] * (ze[k] - zrp[k] * zl[k] * zinv[k]);
     }
 
     void dense_steps(double& block_p, double& block_d) {
         for (int k = 0; k < 2 * p; k++) {
             if (!(zl[k] > 0)) continue;
-            zu[k] = ((k & 1 ? -dz[k / 2] : dz[k / 2]) + zrp[k]) / zw[k];
+            zu[k] = ((k & 1 ? -dz[k / 2] : dz[k / 2]) + zrp[k]) * zl[k] * zinv[k];
             zv[k] = ze[k] - 1.0 - zu[k];
             block_p = max2(block_p, -zu[k]);
             block_d = max2(block_d, -zv[k]);
@@ -991,17 +999,17 @@ struct BandedIpm : Shape<N, Y, Boxed> {
             for (int c = 0; c < p; c++) kz[c] = -cz[c];
             dense_rhs();
         }
-        V block_p(0.0), block_d(0.0), Su(0.0), Suu(0.0);
+        V least(0.0), most(-1.0), Su(0.0), Suu(0.0);
         answer(!soft, none, [&](I i, I k_, const V& dw) {
             const I k = i * pw + k_;
-            const V a = dw * (l[k] * inv[k]), wl = w[k] * l[k];
+            const V t = dw * l[k], a = t * inv[k];  // w l u = l dw
             u[k] = a;
-            block_p = larger(block_p, -a);
-            block_d = larger(block_d, V(1.0) + a);
-            Su += wl * a;
-            Suu += wl * a * a;
+            least = smaller(least, a);
+            most = larger(most, a);
+            Su += t;
+            Suu += t * a;
         });
-        double bp = max_lanes(block_p), bd = max_lanes(block_d);
+        double bp = -min_lanes(least), bd = 1.0 + max_lanes(most);
         dense_steps(bp, bd);
         ap = min2(1.0, 1.0 / max2(bp, 1e-300));
         ad = min2(1.0, 1.0 / max2(bd, 1e-300));
@@ -1016,28 +1024,28 @@ struct BandedIpm : Shape<N, Y, Boxed> {
 
     // (u, v) of the e that `v` and `ze` hold
     void direction(double& block_p_, double& block_d_) {
-        V block_p(0.0), block_d(0.0);
+        V least_p(0.0), least_d(0.0);
         answer(false, [&](I i, I k) { return v[i * pw + k]; }, [&](I i, I k_, const V& dw) {
             const I k = i * pw + k_;
-            const V un = dw * (l[k] * inv[k]), vn = where_positive(l[k], v[k] - V(1.0) - un, V(0.0));
+            const V un = dw * l[k] * inv[k], vn = where_positive(l[k], v[k] - V(1.0) - un, V(0.0));
             u[k] = un;
             v[k] = vn;
-            block_p = larger(block_p, -un);
-            block_d = larger(block_d, -vn);
+            least_p = smaller(least_p, un);
+            least_d = smaller(least_d, vn);
         });
-        block_p_ = max_lanes(block_p);
-        block_d_ = max_lanes(block_d);
+        block_p_ = -min_lanes(least_p);
+        block_d_ = -min_lanes(least_d);
         dense_steps(block_p_, block_d_);
     }
 
-    // products of `target` in every pair, less the affine direction's own product dw dl
-    void corrected(double target_, double& block_p, double& block_d) {
+    // products of `target` in every pair, less a share of the affine direction's own product dw dl
+    void corrected(double target_, double share_, double& block_p, double& block_d) {
         const V target(target_);
-        for (int k = 0; k < 2 * p; k++)
-            if (zl[k] > 0) ze[k] = target_ / (zw[k] * zl[k]) - zu[k] * zv[k];
+        const V share(share_);
+        for (int k = 0; k < 2 * p; k++) ze[k] = target_ * zinv[k] - share_ * zu[k] * zv[k];
         ask([&](I i, I k_) {
             const I k = i * pw + k_;
-            return v[k] = target * inv[k] + u[k] * (V(1.0) + u[k]);
+            return v[k] = target * inv[k] + share * u[k] * (V(1.0) + u[k]);
         });
         direction(block_p, block_d);
     }
@@ -1076,7 +1084,7 @@ struct BandedIpm : Shape<N, Y, Boxed> {
                 }
             }
             double e = sum_lanes(energy);
-            for (int c = 0; c < p; c++) e += pz[c] * pz[c] * (zl[2 * c] / zw[2 * c] + zl[2 * c + 1] / zw[2 * c + 1]);
+            for (int c = 0; c < p; c++) e += pz[c] * pz[c] * (zslope(2 * c) + zslope(2 * c + 1));
             const double gamma = now / e;
             if (!(gamma > 0.0) || gamma > 1e12) return;
             amend(gamma, block_p_, block_d_);
@@ -1085,7 +1093,7 @@ struct BandedIpm : Shape<N, Y, Boxed> {
 
     // (u, v) and (dx, dz) take gamma times (px, pz)
     void amend(double gamma, double& block_p_, double& block_d_) {
-        V block_p(0.0), block_d(0.0);
+        V least_p(0.0), least_d(0.0);
         const V g(gamma);
         for (I i = 0; i < H; i++) {
             V *li = l + i * pw, *ui = u + i * pw, *vi = v + i * pw;
@@ -1094,8 +1102,8 @@ struct BandedIpm : Shape<N, Y, Boxed> {
                 const V du = g * dw * (li[k] * inv[i * pw + k]);
                 ui[k] += du;
                 vi[k] -= du;
-                block_p = larger(block_p, -ui[k]);
-                block_d = larger(block_d, -vi[k]);
+                least_p = smaller(least_p, ui[k]);
+                least_d = smaller(least_d, vi[k]);
             };
             for (int j = 0; j < G; j++) {
                 V ds = j < rows ? dzv[p0 + kind(j)] : V(0.0);
@@ -1109,14 +1117,14 @@ struct BandedIpm : Shape<N, Y, Boxed> {
             }
             for (int k = 0; k < n; k++) dx[i * n + k] += g * px[i * n + k];
         }
-        block_p_ = max_lanes(block_p);
-        block_d_ = max_lanes(block_d);
+        block_p_ = -min_lanes(least_p);
+        block_d_ = -min_lanes(least_d);
         for (int c = 0; c < p; c++) {
             dz[c] += gamma * pz[c];
             for (int side = 0; side < 2; side++) {
                 const int k = 2 * c + side;
                 if (!(zl[k] > 0)) continue;
-                const double du = gamma * (side ? -pz[c] : pz[c]) / zw[k];
+                const double du = gamma * (side ? -pz[c] : pz[c]) * zl[k] * zinv[k];
                 zu[k] += du;
                 zv[k] -= du;
                 block_p_ = max2(block_p_, -zu[k]);
@@ -1250,7 +1258,8 @@ struct BandedIpm : Shape<N, Y, Boxed> {
             double fraction = max2(0.99, 1.0 - mu);
             if (set.point == lp_central) sigma = max2(sigma, 0.2), fraction = 0.9;
             double bp, bd;
-            corrected(sigma * mu, bp, bd);
+            // What the affine direction's product would be after a step of which little can be taken is no correction.
+            corrected(sigma * mu, min2(1.0, 2.0 * std::sqrt(ap * ad)), bp, bd);
 // Refinement where the last direction was not accurate, or the path hardly went on.
             const bool slipped = slip > set.tol && slip > 0.1 * gap, slow = merit > 0.5 * last && merit < 1e-2;
             const int steps = set.point == lp_central ? 0 : slipped ? 3 : slow ? 2 : 0;
