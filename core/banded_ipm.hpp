@@ -15,9 +15,10 @@
 // lives in lane k / H at place k % H; the last state of a stretch is a separator: it is the left border of the next
 // stretch, and the P separators form a short chain of their own, solved in plain doubles.
 //
-// One iteration (Mehrotra's predictor and corrector) is four sweeps: forwards to take the last step, assemble and
-// factor; backwards for the affine direction, whose right-hand side is only -c; forwards for the corrected right-hand
-// side; backwards for the direction. Rows stay feasible by construction (s can always grow), so only caps on s carry a
+// One iteration (Mehrotra's predictor and corrector, the corrector shortened where the affine step is: Colombo and
+// Gondzio, 2008) is five sweeps: forwards to take the last step and measure; forwards to assemble and factor; backwards
+// for the affine direction, whose right-hand side is only -c; forwards for the corrected right-hand side; backwards for
+// the direction. Rows stay feasible by construction (s can always grow), so only caps on s carry a
 // primal residual. Directions are kept relative, u = dw / w and v = dl / l: a step is w (1 + alpha u).
 //
 // Units: row k of kind j is multiplied by kappa_j = c_g / h_j, columns of x and theta are divided by their norms, and
@@ -1203,7 +1204,7 @@ struct BandedIpm : Shape<N, Y, Boxed> {
         double best = 1e300, ap = 0, ad = 0, free_cost = 1.0;
         for (int c = 0; c < p; c++) free_cost = cz[c] > 0 ? 0.0 : free_cost;
         int since = 0, it = 0;
-        double promised = 1e300, last = 1e300;
+        double promised = 1e300;
         bool kept = false, step = false;
         for (;; it++) {
             if (step) dense_take(ap, ad);
@@ -1257,14 +1258,11 @@ struct BandedIpm : Shape<N, Y, Boxed> {
             sigma = sigma < 1.0 ? sigma : 1.0;
             double fraction = max2(0.99, 1.0 - mu);
             if (set.point == lp_central) sigma = max2(sigma, 0.2), fraction = 0.9;
-            double bp, bd;
             // What the affine direction's product would be after a step of which little can be taken is no correction.
+            double bp, bd;
             corrected(sigma * mu, min2(1.0, 2.0 * std::sqrt(ap * ad)), bp, bd);
-// Refinement where the last direction was not accurate, or the path hardly went on.
-            const bool slipped = slip > set.tol && slip > 0.1 * gap, slow = merit > 0.5 * last && merit < 1e-2;
-            const int steps = set.point == lp_central ? 0 : slipped ? 3 : slow ? 2 : 0;
-            last = merit;
-            refine(steps, bp, bd);
+            // Refinement where the last direction was not accurate.
+            if (set.point != lp_central && slip > set.tol && slip > 0.1 * gap) refine(3, bp, bd);
             ap = min2(1.0, fraction / max2(bp, 1e-300));
             ad = min2(1.0, fraction / max2(bd, 1e-300));
             promised = (1.0 - ad) * dinf;
