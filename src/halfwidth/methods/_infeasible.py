@@ -35,9 +35,7 @@ _PART = 1e-6
 _MOST = 200
 
 
-def inflation(
-    task: "Task", solvers: Sequence[Solver], grow: NDArray[np.bool_]
-) -> tuple[float | None, Array | None]:
+def inflation(task: "Task", solvers: Sequence[Solver], grow: NDArray[np.bool_]) -> tuple[float | None, Array | None]:
     """Return the least common factor on the half-widths that fits a trajectory, and that trajectory.
 
     The caps of unknown half-widths grow, and known ones where `grow` says so; half-widths without a cap bound nothing.
