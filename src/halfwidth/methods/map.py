@@ -96,8 +96,8 @@ class BatchLP:
     point : {"central", "least_squares", "optimal"}
         ``"central"``: the point of the central path at a relative gap of 0.3, short of the optimum, where states are
         estimated best; of the logarithm, of the program that ends at its optimum. Or a trajectory of the optimal face:
-        that of least squares in units of sigma, inside the optimal half-widths widened by 1e-6 of sigma (1e-4 where that
-        leaves too little room); or the one the solver happens to return.
+        that of least squares in units of sigma, inside the optimal half-widths widened by 1e-6 of sigma (1e-4 where
+        that leaves too little room); or the one the solver happens to return.
     grow_caps : bool
         Where the caps ``at_most`` of unknown half-widths leave no trajectory, double them until one fits (step 7 of
         the paper's algorithm); ``info["caps_grown"]`` says how often.

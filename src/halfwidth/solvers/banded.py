@@ -247,7 +247,8 @@ def solve(
     if status is Status.OK or not fallback:
         return answer
     if status is Status.REDUCED:
-        answer = _again(c, answer, point, tol, max_iter, multipliers)
+        if point == "optimal":
+            answer = _again(c, answer, tol, max_iter, multipliers)
         if answer.status is Status.OK or c.T > _LARGE:
             return answer
     return _proved(c, answer)
@@ -260,35 +261,32 @@ def _arrays(c: Chain) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
-def _again(chain: Chain, answer: Answer, point: Point, tol: float, max_iter: int, multipliers: bool) -> Answer:
+def _again(chain: Chain, answer: Answer, tol: float, max_iter: int, multipliers: bool) -> Answer:
     """Solve the program measured from an answer of reduced accuracy; return the better of the two.
 
-    What rounding left of large states is gone there: the refinement of linear programs after Gleixner, Steffy and
+    What rounding took from large states is gone there: the refinement of linear programs after Gleixner, Steffy and
     Wolter (2016).
     """
-    near = _Near.of(chain, answer)
-    if point != "optimal" or not all(np.isfinite(part).all() for part in (near.chain.A, near.chain.bx, near.chain.by)):
+    c, x, theta = chain, answer.x, answer.theta
+    E, A, C = (np.eye(x.shape[1]) if M is None else M for M in (c.E, c.A, c.C))
+    at = np.zeros((c.T, len(c.h))) if c.G is None else c.G @ theta
+    at[:, : x.shape[1]] += (E @ x[1:, :, None] - A @ x[:-1, :, None])[..., 0]
+    at[:, x.shape[1] :] += (C @ x[1:, :, None])[..., 0]
+    ends = {
+        name: None if end is None else end - place
+        for name, end, place in (
+            ("lo", c.lo, x), ("hi", c.hi, x), ("x0_lo", c.x0_lo, x[0]), ("x0_hi", c.x0_hi, x[0]),
+            ("theta_lo", c.theta_lo, theta), ("theta_hi", c.theta_hi, theta),
+        )
+    }  # fmt: skip
+    by = np.where(c.seen, c.by, 0.0) - np.where(c.seen, at[:, x.shape[1] :], 0.0)
+    moved = replace(chain, bx=np.ascontiguousarray(c.bx - at[:, : x.shape[1]]), by=by, **ends)
+    if not (np.isfinite(moved.bx).all() and np.isfinite(moved.by).all()):
         return answer
-    x, theta, s, lam, slack, info = lp_solve(
-        *_arrays(near.chain), POINTS[point], tol, 0.3, max_iter, multipliers, None, 0, False
-    )
-    if STATUSES[info["status"]] is not Status.OK:
+    more = solve(moved, point="optimal", tol=tol, max_iter=max_iter, multipliers=multipliers, fallback=False)
+    if more.status is not Status.OK:
         return answer
-    s = np.clip(near.s * s, chain.floor, np.maximum(chain.cap, chain.floor))
-    slack = None if slack is None else slack * near.row
-    value = float(chain.c @ s) + (0.0 if slack is None or chain.slack is None else float((slack @ chain.slack).sum()))
-    return answer._replace(
-        x=near.point + near.x * x,
-        theta=near.at + near.theta * theta,
-        s=s,
-        multipliers=None if lam is None else lam * (near.size / near.row)[:, None],
-        slack=slack,
-        status=Status.OK,
-        objective=value,
-        gap=info["gap"],
-        iterations=answer.iterations + info["iterations"],
-        start=None,
-    )
+    return more._replace(x=x + more.x, theta=theta + more.theta, iterations=answer.iterations + more.iterations)
 
 
 def _proved(chain: Chain, answer: Answer) -> Answer:
