@@ -272,7 +272,7 @@ def _again(chain: Chain, answer: Answer, tol: float, max_iter: int, multipliers:
     at = np.zeros((c.T, len(c.h))) if c.G is None else c.G @ theta
     at[:, : x.shape[1]] += (E @ x[1:, :, None] - A @ x[:-1, :, None])[..., 0]
     at[:, x.shape[1] :] += (C @ x[1:, :, None])[..., 0]
-    ends = {
+    ends: dict[str, Any] = {
         name: None if end is None else end - place
         for name, end, place in (
             ("lo", c.lo, x), ("hi", c.hi, x), ("x0_lo", c.x0_lo, x[0]), ("x0_hi", c.x0_hi, x[0]),
