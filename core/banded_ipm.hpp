@@ -15,9 +15,10 @@
 // lives in lane k / H at place k % H; the last state of a stretch is a separator: it is the left border of the next
 // stretch, and the P separators form a short chain of their own, solved in plain doubles.
 //
-// One iteration (Mehrotra's predictor and corrector) is four sweeps: forwards to take the last step, assemble and
-// factor; backwards for the affine direction, whose right-hand side is only -c; forwards for the corrected right-hand
-// side; backwards for the direction. Rows stay feasible by construction (s can always grow), so only caps on s carry a
+// One iteration (Mehrotra's predictor and corrector, the corrector shortened where the affine step is: Colombo and
+// Gondzio, 2008) is five sweeps: forwards to take the last step and measure; forwards to assemble and factor; backwards
+// for the affine direction, whose right-hand side is only -c; forwards for the corrected right-hand side; backwards for
+// the direction. Rows stay feasible by construction (s can always grow), so only caps on s carry a
 // primal residual. Directions are kept relative, u = dw / w and v = dl / l: a step is w (1 + alpha u).
 //
 // Units: row k of kind j is multiplied by kappa_j = c_g / h_j, columns of x and theta are divided by their norms, and
@@ -35,37 +36,47 @@ constexpr double lp_inf = 1e300;     // bounds at or beyond this are absent
 constexpr double lp_warm_gap = 0.1;  // relative gap of the iterate that the next window starts from
 constexpr double lp_pinned = 1e100;  // added to the diagonal of a variable that must not move
 
-// The sizes that are compiled for: n alone (0: not even that), or n and m of a plain program, which has no theta, no E,
-// no slacks and as many half-widths as kinds of rows.
-template <int N, int Y>
+// The sizes that are compiled for: n alone (0: not even that), or all of a plain program, which has no theta, no E, no
+// slacks and a half-width of its own for every kind of row; boxes on its states or none.
+template <int N, int Y, bool Boxed>
 struct Shape {
     static constexpr int m = Y, rows = N + Y, p0 = 0, ns = N + Y, p = N + Y;
-    static constexpr bool soft = false, unit_E = true;
+    static constexpr bool soft = false, unit_E = true, boxed = Boxed;
+    static constexpr int G = rows + (Boxed ? N : 0);      // pairs a state: rows, then boxes
+    static constexpr std::ptrdiff_t pw = 2 * G;           // pair entries a state: 2 G, then a slack a row
+    static constexpr std::ptrdiff_t zq = N * (N + p);     // entries of Z a state
     explicit Shape(const LpProblem&) {}
+    static int kind(int j) { return j; }
     static bool fits(const LpProblem& lp) {
-        return lp.n == N && lp.m == Y && lp.ns == N + Y && lp.p0 == 0 && !lp.E && !lp.slack;
+        bool own = lp.ns == N + Y;
+        for (int j = 0; own && j < N + Y; j++) own = lp.group[j] == j;
+        return own && lp.n == N && lp.m == Y && lp.p0 == 0 && !lp.E && !lp.slack && Boxed == (lp.lo || lp.x0_lo);
     }
 };
 template <int N>
-struct Shape<N, 0> {
+struct Shape<N, 0, false> {
     const int m, rows, p0, ns, p;  // p = p0 + ns border columns
-    const bool soft, unit_E;
+    const bool soft, unit_E, boxed;
+    const int G;
+    const std::ptrdiff_t pw, zq;
+    const int* const group;
     explicit Shape(const LpProblem& lp)
-        : m(lp.m), rows(lp.n + lp.m), p0(lp.p0), ns(lp.ns), p(lp.p0 + lp.ns), soft(lp.slack), unit_E(!lp.E) {}
+        : m(lp.m), rows(lp.n + lp.m), p0(lp.p0), ns(lp.ns), p(lp.p0 + lp.ns), soft(lp.slack), unit_E(!lp.E),
+          boxed(lp.lo || lp.x0_lo), G(rows + (boxed ? lp.n : 0)), pw(2 * G + (soft ? rows : 0)),
+          zq(std::ptrdiff_t(lp.n) * (lp.n + p)), group(lp.group) {}
+    int kind(int j) const { return group[j]; }
 };
 
-template <int P, int N, int Y>
-struct BandedIpm : Shape<N, Y> {
+template <int P, int N, int Y = 0, bool Boxed = false>
+struct BandedIpm : Shape<N, Y, Boxed> {
     using V = Lanes<P>;
     using I = std::ptrdiff_t;
-    using Size = Shape<N, Y>;
-    using Size::m, Size::rows, Size::p0, Size::ns, Size::p, Size::soft, Size::unit_E;
+    using Size = Shape<N, Y, Boxed>;
+    using Size::m, Size::rows, Size::p0, Size::ns, Size::p, Size::soft, Size::unit_E, Size::boxed, Size::G, Size::pw,
+        Size::zq, Size::kind;
     const LpProblem& lp;
     const LpSettings& set;
     Dim<N> n;
-    const bool boxed;
-    const int G;  // pairs a state: rows, then boxes
-    const I pw, zq;  // pair entries a state: 2 G, then a slack a row; entries of Z a state
     const int H;
     bool capped;
 
@@ -74,19 +85,19 @@ struct BandedIpm : Shape<N, Y> {
     I dE, dA, dC;
     // iterate, directions, the reference that b is relative to, the best iterate so far
     V *x, *w, *l, *u, *v, *dx, *px, *xref, *xbest, *lbest, *wbest, *xwarm, *lwarm;
+    V* inv;  // 1 / (w l), and 0 where there is no row: whatever is multiplied by it leaves such a pair out
     // factor and right-hand side
     V *L, *O, *Z, *f, *Q, *K, *acc, *zacc;
     // one state's worth of scratch
     V *W, *Sg, *Ws, *nu, *rho, *own, *bef, *bef0, *back, *back0, *Bb, *Bb0, *wk, *dres, *lz, *left, *dzv;
     // the dense end: z = (theta, s), its bounds as pairs, its Schur complement, the chain of separators
-    double *sx, *kappa, *cz, *sz, *z, *dz, *zref, *kz, *zbest, *zlo, *zhi, *zw, *zl, *zu, *zv, *ze, *zrp, *zlbest, *zwarm, *zlwarm;
+    double *sx, *kappa, *cz, *sz, *z, *dz, *zref, *kz, *zbest, *zlo, *zhi, *zw, *zl, *zu, *zv, *ze, *zrp, *zinv, *zlbest, *zwarm, *zlwarm;
     double *Kd, *KL, *Kpiv, *Kinv, *Korig, *zcg, *pz, *rM, *rO, *rZ, *rQ, *rf, *rx, *racc, *rw, *hmax, *count;
     double S, reg, drop, mu_pairs, rounding;  // what the largest state leaves of a residual, in units S
     double objective, comp, dinf, pinf, dual;  // of the current iterate, set by `assemble`
 
     BandedIpm(const LpProblem& lp_, const LpSettings& set_)
-        : Size(lp_), lp(lp_), set(set_), n(lp_.n), boxed(lp_.lo || lp_.x0_lo), G(rows + (boxed ? int(n) : 0)),
-          pw(2 * G + (soft ? rows : 0)), zq(I(n) * (n + p)), H((lp_.T + P) / P) {
+        : Size(lp_), lp(lp_), set(set_), n(lp_.n), H((lp_.T + P) / P) {
         dE = lp.E_t ? n * n : 0;
         dA = lp.A_t ? n * n : 0;
         dC = lp.C_t ? m * n : 0;
@@ -106,7 +117,7 @@ struct BandedIpm : Shape<N, Y> {
         xlo = c.take<V>(boxed ? h * n : 0);
         xhi = c.take<V>(boxed ? h * n : 0);
         c.many(h * n, x, dx, xref, xbest, f, px);
-        c.many(h * pw, w, l, u, v, lbest);
+        c.many(h * pw, w, l, u, v, inv, lbest);
         wbest = c.take<V>(soft ? h * pw : 0);
         xwarm = c.take<V>(set.warm ? h * n : 0);
         lwarm = c.take<V>(set.warm ? h * pw : 0);
@@ -125,7 +136,7 @@ struct BandedIpm : Shape<N, Y> {
         sx = c.take<double>(n);
         c.many(rows, kappa, hmax, count);
         c.many(p, cz, sz, z, dz, zref, kz, zbest, zlo, zhi, Kpiv, Kinv, racc, Korig, zcg, pz, zwarm);
-        c.many(2 * p, zw, zl, zu, zv, ze, zrp, zlbest, zlwarm);
+        c.many(2 * p, zw, zl, zu, zv, ze, zrp, zinv, zlbest, zlwarm);
         c.many(I(p) * p, Kd, KL);
         c.many(P * nn, rM, rO);
         rZ = c.take<double>(I(P) * n * p);
@@ -180,9 +191,9 @@ struct BandedIpm : Shape<N, Y> {
     }
 
     // weights of row or box j at place i: W on (rho,rho), Sj on (rho,s), Wsj on (s,s); a slack is eliminated here
-    inline void weigh(const V* wi, const V* li, int j, V& Wj, V& Sj, V& Wsj) const {
+    inline void weigh(I i, int j, V& Wj, V& Sj, V& Wsj) const {
         V Wd, Sd, de;
-        slopes(wi, li, j, Wd, Sd, de);
+        slopes(i, j, Wd, Sd, de);
         Wj = Wsj = Wd;
         Sj = Sd;
         if (soft && j < rows) {
@@ -194,21 +205,18 @@ struct BandedIpm : Shape<N, Y> {
     }
 
     // d = l / w of a pair, as sum and difference, and of its slack
-    inline void slopes(const V* wi, const V* li, int j, V& Wd, V& Sd, V& de) const {
-        const V dp = li[2 * j] / wi[2 * j], dm = li[2 * j + 1] / wi[2 * j + 1];
+    inline void slopes(I i, int j, V& Wd, V& Sd, V& de) const {
+        const V dp = slope(i * pw + 2 * j), dm = slope(i * pw + 2 * j + 1);
         Wd = dp + dm;
         Sd = dm - dp;
-        de = soft && j < rows ? li[2 * G + j] / wi[2 * G + j] : V(0.0);
+        de = soft && j < rows ? slope(i * pw + 2 * G + j) : V(0.0);
     }
+    inline V slope(I k) const { return l[k] * (l[k] * inv[k]); }
 
     // ---- forward: assemble and factor -----------------------------------------------------------------------------
 
-    // Take the step (ap, ad) along (u, v), measure the new iterate, and factor Newton's matrix there.
-    void assemble(double ap, double ad, bool step, bool measure) {
-        const I nn = I(n) * n;
-        const int q = n + p;
-        for (int c = 0; c < tri(q, 0); c++) Q[c] = V(0.0);
-        for (int c = 0; c < p * p; c++) K[c] = V(0.0);
+    // Take the step (ap, ad) along (u, v) and measure the new iterate.
+    void advance(double ap, double ad, bool step) {
         for (int c = 0; c < p; c++) zacc[c] = V(0.0);
         V gap_sum(0.0), res_sum(0.0), dual_sum(0.0), slack_sum(0.0);
         const V a_p(ap), a_d(ad);
@@ -222,27 +230,47 @@ struct BandedIpm : Shape<N, Y> {
                 }
                 for (int k = 0; k < n; k++) xi[k] += a_p * dx[i * n + k];
             }
-            if (measure) {
-                for (I k = 0; k < pw; k++) gap_sum += wi[k] * li[k];
-                for (int j = 0; j < G; j++) nu[j] = li[2 * j] - li[2 * j + 1];
-                adjoint(i, nu, own, bef, true);
-                if (i > 0) res_sum += residual_of(i - 1, bef);
-                else for (int k = 0; k < n; k++) bef0[k] = bef[k];
-                for (int k = 0; k < n; k++) dres[k] = own[k];
-                for (int j = 0; j < rows; j++) zacc[p0 + lp.group[j]] += li[2 * j] + li[2 * j + 1];
-                if (capped) {
-                    for (int j = 0; j < rows; j++) dual_sum -= b[i * rows + j] * nu[j];
-                    if (boxed)
-                        for (int k = 0; k < n; k++) {
-                            const int j = 2 * (rows + k);  // bounds are x + w+ above and x - w- below
-                            dual_sum += li[j + 1] * (xi[k] - wi[j + 1]) - li[j] * (xi[k] + wi[j]);
-                        }
-                }
-                if (soft)
-                    for (int j = 0; j < rows; j++)
-                        slack_sum += where_positive(li[2 * G + j], V(lp.slack[j] / kappa[j]) * wi[2 * G + j], V(0.0));
+            for (I k = 0; k < pw; k++) gap_sum += wi[k] * li[k];
+            for (int j = 0; j < G; j++) nu[j] = li[2 * j] - li[2 * j + 1];
+            adjoint(i, nu, own, bef, true);
+            if (i > 0) res_sum += residual_of(i - 1, bef);
+            else for (int k = 0; k < n; k++) bef0[k] = bef[k];
+            for (int k = 0; k < n; k++) dres[k] = own[k];
+            for (int j = 0; j < rows; j++) zacc[p0 + kind(j)] += li[2 * j] + li[2 * j + 1];
+            if (capped) {
+                for (int j = 0; j < rows; j++) dual_sum -= b[i * rows + j] * nu[j];
+                if (boxed)
+                    for (int k = 0; k < n; k++) {
+                        const int j = 2 * (rows + k);  // bounds are x + w+ above and x - w- below
+                        dual_sum += li[j + 1] * (xi[k] - wi[j + 1]) - li[j] * (xi[k] + wi[j]);
+                    }
             }
-            for (int j = 0; j < G; j++) weigh(wi, li, j, W[j], Sg[j], Ws[j]);
+            if (soft)
+                for (int j = 0; j < rows; j++)
+                    slack_sum += where_positive(li[2 * G + j], V(lp.slack[j] / kappa[j]) * wi[2 * G + j], V(0.0));
+        }
+        for (int k = 0; k < n; k++) bef[k] = from_after(bef0[k]);
+        res_sum += residual_of(H - 1, bef);
+        measure_dense(sum_lanes(gap_sum), sum_lanes(res_sum), sum_lanes(dual_sum), sum_lanes(slack_sum));
+    }
+
+    inline void invert(I i) {
+        for (I k = i * pw; k < (i + 1) * pw; k++) {
+            const V product = w[k] * l[k];
+            inv[k] = where_positive(product - V(1e-290), V(1.0) / product, V(0.0));
+        }
+    }
+
+    // Newton's matrix at the iterate, factored.
+    void assemble() {
+        const I nn = I(n) * n;
+        const int q = n + p;
+        for (int c = 0; c < tri(q, 0); c++) Q[c] = V(0.0);
+        for (int c = 0; c < p * p; c++) K[c] = V(0.0);
+        invert(0);
+        for (I i = 0; i < H; i++) {
+            if (i + 1 < H) invert(i + 1);  // ahead of its use: divisions are slow, and nothing here waits for these
+            for (int j = 0; j < G; j++) weigh(i, j, W[j], Sg[j], Ws[j]);
             blocks(i);
             if (i > 0) {
                 V *Lb = L + (i - 1) * nn, *Zb = Z + (i - 1) * zq;
@@ -255,17 +283,7 @@ struct BandedIpm : Shape<N, Y> {
                 for (int k = 0; k < n * p; k++) Bb0[k] = Bb[k];
             }
         }
-        if (measure) {
-            for (int k = 0; k < n; k++) bef[k] = from_after(bef0[k]);
-            res_sum += residual_of(H - 1, bef);
-            measure_dense(sum_lanes(gap_sum), sum_lanes(res_sum), sum_lanes(dual_sum), sum_lanes(slack_sum));
-        }
         separators();
-    }
-
-    // a / (w l) of a pair, 0 where there is no row
-    static inline V share(const V& a, const V& w_, const V& l_) {
-        return where_positive(l_, a / (w_ * where_positive(l_, l_, V(1.0))), V(0.0));
     }
 
     inline V residual_of(I i, const V* after) const {
@@ -323,7 +341,7 @@ struct BandedIpm : Shape<N, Y> {
                 for (int d = 0; d <= c; d++) K[c * p + d] += wg * g[j * p0 + d];
             }
         for (int j = 0; j < n; j++) {
-            const int s = p0 + lp.group[j];
+            const int s = p0 + kind(j);
             for (int k = 0; k < n; k++) {
                 if (unit_E) {
                     if (k == j) B[s * n + k] += Ed[k] * Sg[j];
@@ -334,9 +352,9 @@ struct BandedIpm : Shape<N, Y> {
             }
         }
         for (int j = 0; j < m; j++)
-            for (int k = 0; k < n; k++) B[(p0 + lp.group[n + j]) * n + k] += Ci[j * n + k] * Sg[n + j];
+            for (int k = 0; k < n; k++) B[(p0 + kind(n + j)) * n + k] += Ci[j * n + k] * Sg[n + j];
         for (int j = 0; j < rows; j++) {
-            const int s = p0 + lp.group[j];
+            const int s = p0 + kind(j);
             K[s * p + s] += Ws[j];
             for (int c = 0; c < p0; c++) K[s * p + c] += Sg[j] * g[j * p0 + c];
         }
@@ -361,19 +379,22 @@ struct BandedIpm : Shape<N, Y> {
             }
         for (int c = 0; c < tri(p, 0); c++) rQ[c] = 0.0;
         chain_factor(n, P, p, rM, rO, rZ, rQ, drop, rw);
+        for (int k = 0; k < 2 * p; k++) zinv[k] = zl[k] > 0 ? 1.0 / (zw[k] * zl[k]) : 0.0;
         for (int c = 0; c < p; c++)
             for (int d = 0; d <= c; d++) {
                 double s = sum_lanes(K[c * p + d] - Q[tri(n + c, n + d)]) - rQ[tri(c, d)];
                 if (c == d) {
                     Korig[c] = sum_lanes(K[c * p + c]);
                     s += reg;
-                    s += zl[2 * c] / zw[2 * c] + zl[2 * c + 1] / zw[2 * c + 1];
+                    s += zslope(2 * c) + zslope(2 * c + 1);
                     if (zhi[c] == zlo[c]) s += lp_pinned;
                 }
                 Kd[c * p + d] = Kd[d * p + c] = s;
             }
         dense_factor();
     }
+
+    double zslope(int k) const { return zl[k] * (zl[k] * zinv[k]); }
 
     // Kd = L D L' of the corner. A pivot lost to rounding is held at what rounding leaves of its diagonal entry: its
     // half-width then moves too little, never too far.
@@ -406,7 +427,7 @@ struct BandedIpm : Shape<N, Y> {
             for (int j = 0; j < G; j++) {
                 V t(0.0);
                 row(i, j, nu[j], t);
-                if (j < rows) zacc[p0 + lp.group[j]] += t;
+                if (j < rows) zacc[p0 + kind(j)] += t;
             }
             adjoint(i, nu, own, bef, true);
             V* fi = f + i * n;
@@ -473,7 +494,7 @@ struct BandedIpm : Shape<N, Y> {
             zhi[p0 + c] = lp.cap[c] >= lp_inf ? 2 * lp_inf : lp.cap[c] / sz[p0 + c];
             zref[p0 + c] = 0.0;
         }
-        for (int j = 0; j < rows; j++) kappa[j] = 1.0 / (lp.h[j] * sz[p0 + lp.group[j]]);
+        for (int j = 0; j < rows; j++) kappa[j] = 1.0 / (lp.h[j] * sz[p0 + kind(j)]);
         for (int j = 0; j < m; j++) {  // share of the rows in which an output is seen
             int c = 0;
             for (I t = 0; t < T; t++) c += lp.seen[t * m + j];
@@ -595,7 +616,7 @@ struct BandedIpm : Shape<N, Y> {
     void least_squares() {
         reg = 1e-8;
         for (int k = 0; k < 2 * p; k++) zw[k] = 1.0, zl[k] = 0.0;
-        assemble(0, 0, false, false);
+        assemble();
         forward([&](I i, int j, V& nu_, V&) { nu_ = j < rows ? -b[i * rows + j] : V(0.0); });
         backward(false, dx, dz, [](I, const V*, const V*) {});
         recentre();
@@ -647,7 +668,7 @@ struct BandedIpm : Shape<N, Y> {
         V sum(0.0);
         for (I i = 0; i < H; i++)
             for (int j = 0; j < rows; j++) {
-                const double s = z[p0 + lp.group[j]], lam = kz[p0 + lp.group[j]];
+                const double s = z[p0 + kind(j)], lam = kz[p0 + kind(j)];
                 V *wi = w + i * pw + 2 * j, *li = l + i * pw + 2 * j;
                 const V on = li[0], rj = -b[i * rows + j];
                 V ws(s);
@@ -705,7 +726,7 @@ struct BandedIpm : Shape<N, Y> {
     bool rows_of(int c, double& top, double& number) {
         top = number = 0.0;
         for (int j = 0; j < rows; j++)
-            if (lp.group[j] == c) top = max2(top, hmax[j] / S), number += count[j];
+            if (kind(j) == c) top = max2(top, hmax[j] / S), number += count[j];
         if (number == 0.0) z[p0 + c] = zhi[p0 + c] = zlo[p0 + c];
         return number > 0.0;
     }
@@ -797,18 +818,18 @@ struct BandedIpm : Shape<N, Y> {
         for (int c = 0; c < p; c++) z[c] = 0.0;
         for (int c = 0; c < ns; c++) {
             double top_c, n_c;
-            if (rows_of(c, top_c, n_c)) z[p0 + c] = max2(max2(from.s[c] / (sz[p0 + c] * S), (1 + 1e-9) * top_c), zlo[p0 + c] + 1e-6);
+            if (rows_of(c, top_c, n_c)) z[p0 + c] = max2(max2(1.05 * from.s[c] / (sz[p0 + c] * S), (1 + 1e-9) * top_c), zlo[p0 + c] + 1e-6);
         }
         for (I k = max2(I(1), from.T - from.drop + 1); k <= lp.T; k++)  // room for the new rows
             for (int j = 0; j < rows; j++) {
-                double& zj = z[p0 + lp.group[j]];
+                double& zj = z[p0 + kind(j)];
                 zj = max2(zj, 1.2 * std::fabs(b[k % H * rows + j][k / H]) + 1e-3);
             }
         double sum = 0.0, known = 0.0;
         for (I i = 0; i < H; i++)
             for (int j = 0; j < rows; j++) {
                 V *wi = w + i * pw + 2 * j, *li = l + i * pw + 2 * j;
-                const V on = li[0], rj = -b[i * rows + j], s(z[p0 + lp.group[j]]);
+                const V on = li[0], rj = -b[i * rows + j], s(z[p0 + kind(j)]);
                 wi[0] = where_positive(on, s - rj, V(1.0));
                 wi[1] = where_positive(on, s + rj, V(1.0));
                 for (int t = 0; t < P; t++) {
@@ -904,13 +925,13 @@ struct BandedIpm : Shape<N, Y> {
     // asked beyond it goes into the right-hand side as l e.
     void dense_rhs() {
         for (int k = 0; k < 2 * p; k++)
-            if (zl[k] > 0) kz[k / 2] += (k & 1 ? -1.0 : 1.0) * zl[k] * (ze[k] - zrp[k] / zw[k]);
+            kz[k / 2] += (k & 1 ? -1.0 : 1.0) * zl[k] * (ze[k] - zrp[k] * zl[k] * zinv[k]);
     }
 
     void dense_steps(double& block_p, double& block_d) {
         for (int k = 0; k < 2 * p; k++) {
             if (!(zl[k] > 0)) continue;
-            zu[k] = ((k & 1 ? -dz[k / 2] : dz[k / 2]) + zrp[k]) / zw[k];
+            zu[k] = ((k & 1 ? -dz[k / 2] : dz[k / 2]) + zrp[k]) * zl[k] * zinv[k];
             zv[k] = ze[k] - 1.0 - zu[k];
             block_p = max2(block_p, -zu[k]);
             block_d = max2(block_d, -zv[k]);
@@ -918,9 +939,9 @@ struct BandedIpm : Shape<N, Y> {
     }
 
     // the slack's own step at row j: de = (t - Wd ds - Sd drho) / (Wd + de)
-    inline V slack_step(const V* wi, const V* li, int j, const V& t, const V& ds, const V& drho) const {
+    inline V slack_step(I i, int j, const V& t, const V& ds, const V& drho) const {
         V Wd, Sd, de;
-        slopes(wi, li, j, Wd, Sd, de);
+        slopes(i, j, Wd, Sd, de);
         return (t - Wd * ds - Sd * drho) * (V(1.0) / larger(Wd + de, V(1e-300)));
     }
 
@@ -934,13 +955,13 @@ struct BandedIpm : Shape<N, Y> {
     template <class AskFn>
     void ask(AskFn e) {
         forward([&](I i, int j, V& nu_, V& t) {
-            const V *wi = w + i * pw, *li = l + i * pw;
+            const V* li = l + i * pw;
             const V zp = li[2 * j] * e(i, 2 * j), zm = li[2 * j + 1] * e(i, 2 * j + 1);
             nu_ = zp - zm;
             t = zp + zm;
             if (soft && j < rows) {
                 V Wd, Sd, de;
-                slopes(wi, li, j, Wd, Sd, de);
+                slopes(i, j, Wd, Sd, de);
                 const V own_ = slack_rhs(li, j, t + li[2 * G + j] * e(i, 2 * G + j)) * (V(1.0) / larger(Wd + de, V(1e-300)));
                 nu_ += Sd * own_;
                 t -= Wd * own_;
@@ -953,13 +974,13 @@ struct BandedIpm : Shape<N, Y> {
     template <class AskFn, class TakeFn>
     void answer(bool zero_rhs, AskFn e, TakeFn take) {
         backward(zero_rhs, dx, dz, [&](I i, const V* xi, const V* xb) {
-            const V *wi = w + i * pw, *li = l + i * pw;
+            const V* li = l + i * pw;
             apply(i, xi, xb, p0 ? dzv : nullptr, rho);
             for (int j = 0; j < G; j++) {
-                V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
+                V ds = j < rows ? dzv[p0 + kind(j)] : V(0.0);
                 if (soft && j < rows) {
                     const V asked = li[2 * j] * e(i, 2 * j) + li[2 * j + 1] * e(i, 2 * j + 1) + li[2 * G + j] * e(i, 2 * G + j);
-                    const V de = slack_step(wi, li, j, slack_rhs(li, j, asked), ds, rho[j]);
+                    const V de = slack_step(i, j, slack_rhs(li, j, asked), ds, rho[j]);
                     take(i, 2 * G + j, de);
                     ds += de;
                 }
@@ -979,17 +1000,17 @@ struct BandedIpm : Shape<N, Y> {
             for (int c = 0; c < p; c++) kz[c] = -cz[c];
             dense_rhs();
         }
-        V block_p(0.0), block_d(0.0), Su(0.0), Suu(0.0);
+        V least(0.0), most(-1.0), Su(0.0), Suu(0.0);
         answer(!soft, none, [&](I i, I k_, const V& dw) {
             const I k = i * pw + k_;
-            const V a = where_positive(l[k], dw / w[k], V(0.0)), wl = w[k] * l[k];
+            const V t = dw * l[k], a = t * inv[k];  // w l u = l dw
             u[k] = a;
-            block_p = larger(block_p, -a);
-            block_d = larger(block_d, where_positive(l[k], V(1.0) + a, V(0.0)));
-            Su += wl * a;
-            Suu += wl * a * a;
+            least = smaller(least, a);
+            most = larger(most, a);
+            Su += t;
+            Suu += t * a;
         });
-        double bp = max_lanes(block_p), bd = max_lanes(block_d);
+        double bp = -min_lanes(least), bd = 1.0 + max_lanes(most);
         dense_steps(bp, bd);
         ap = min2(1.0, 1.0 / max2(bp, 1e-300));
         ad = min2(1.0, 1.0 / max2(bd, 1e-300));
@@ -1004,28 +1025,28 @@ struct BandedIpm : Shape<N, Y> {
 
     // (u, v) of the e that `v` and `ze` hold
     void direction(double& block_p_, double& block_d_) {
-        V block_p(0.0), block_d(0.0);
+        V least_p(0.0), least_d(0.0);
         answer(false, [&](I i, I k) { return v[i * pw + k]; }, [&](I i, I k_, const V& dw) {
             const I k = i * pw + k_;
-            const V un = where_positive(l[k], dw / w[k], V(0.0)), vn = where_positive(l[k], v[k] - V(1.0) - un, V(0.0));
+            const V un = dw * l[k] * inv[k], vn = where_positive(l[k], v[k] - V(1.0) - un, V(0.0));
             u[k] = un;
             v[k] = vn;
-            block_p = larger(block_p, -un);
-            block_d = larger(block_d, -vn);
+            least_p = smaller(least_p, un);
+            least_d = smaller(least_d, vn);
         });
-        block_p_ = max_lanes(block_p);
-        block_d_ = max_lanes(block_d);
+        block_p_ = -min_lanes(least_p);
+        block_d_ = -min_lanes(least_d);
         dense_steps(block_p_, block_d_);
     }
 
-    // products of `target` in every pair, less the affine direction's own product dw dl
-    void corrected(double target_, double& block_p, double& block_d) {
+    // products of `target` in every pair, less a share of the affine direction's own product dw dl
+    void corrected(double target_, double share_, double& block_p, double& block_d) {
         const V target(target_);
-        for (int k = 0; k < 2 * p; k++)
-            if (zl[k] > 0) ze[k] = target_ / (zw[k] * zl[k]) - zu[k] * zv[k];
+        const V share(share_);
+        for (int k = 0; k < 2 * p; k++) ze[k] = target_ * zinv[k] - share_ * zu[k] * zv[k];
         ask([&](I i, I k_) {
             const I k = i * pw + k_;
-            return v[k] = share(target, w[k], l[k]) + u[k] * (V(1.0) + u[k]);
+            return v[k] = target * inv[k] + share * u[k] * (V(1.0) + u[k]);
         });
         direction(block_p, block_d);
     }
@@ -1055,17 +1076,16 @@ struct BandedIpm : Shape<N, Y> {
             for (I k = 0; k < I(H) * n; k++) px[k] = step ? f[k] + V(beta) * px[k] : f[k];
             for (int k = 0; k < n; k++) left[k] = from_before(px[(H - 1) * n + k]);
             for (I i = 0; i < H; i++) {
-                const V *wi = w + i * pw, *li = l + i * pw;
                 apply(i, px + i * n, i ? px + (i - 1) * n : left, p0 ? dzv : nullptr, rho);
                 for (int j = 0; j < G; j++) {
-                    const V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
+                    const V ds = j < rows ? dzv[p0 + kind(j)] : V(0.0);
                     V Wj, Sj, Wsj;
-                    weigh(wi, li, j, Wj, Sj, Wsj);
+                    weigh(i, j, Wj, Sj, Wsj);
                     energy += Wj * rho[j] * rho[j] + V(2.0) * Sj * rho[j] * ds + Wsj * ds * ds;
                 }
             }
             double e = sum_lanes(energy);
-            for (int c = 0; c < p; c++) e += pz[c] * pz[c] * (zl[2 * c] / zw[2 * c] + zl[2 * c + 1] / zw[2 * c + 1]);
+            for (int c = 0; c < p; c++) e += pz[c] * pz[c] * (zslope(2 * c) + zslope(2 * c + 1));
             const double gamma = now / e;
             if (!(gamma > 0.0) || gamma > 1e12) return;
             amend(gamma, block_p_, block_d_);
@@ -1074,22 +1094,22 @@ struct BandedIpm : Shape<N, Y> {
 
     // (u, v) and (dx, dz) take gamma times (px, pz)
     void amend(double gamma, double& block_p_, double& block_d_) {
-        V block_p(0.0), block_d(0.0);
+        V least_p(0.0), least_d(0.0);
         const V g(gamma);
         for (I i = 0; i < H; i++) {
-            V *wi = w + i * pw, *li = l + i * pw, *ui = u + i * pw, *vi = v + i * pw;
+            V *li = l + i * pw, *ui = u + i * pw, *vi = v + i * pw;
             apply(i, px + i * n, i ? px + (i - 1) * n : left, p0 ? dzv : nullptr, rho);
             auto take = [&](const V& dw, int k) {
-                const V du = where_positive(li[k], g * dw / wi[k], V(0.0));
+                const V du = g * dw * (li[k] * inv[i * pw + k]);
                 ui[k] += du;
                 vi[k] -= du;
-                block_p = larger(block_p, -ui[k]);
-                block_d = larger(block_d, -vi[k]);
+                least_p = smaller(least_p, ui[k]);
+                least_d = smaller(least_d, vi[k]);
             };
             for (int j = 0; j < G; j++) {
-                V ds = j < rows ? dzv[p0 + lp.group[j]] : V(0.0);
+                V ds = j < rows ? dzv[p0 + kind(j)] : V(0.0);
                 if (soft && j < rows) {
-                    const V de = slack_step(wi, li, j, V(0.0), ds, rho[j]);
+                    const V de = slack_step(i, j, V(0.0), ds, rho[j]);
                     take(de, 2 * G + j);
                     ds += de;
                 }
@@ -1098,14 +1118,14 @@ struct BandedIpm : Shape<N, Y> {
             }
             for (int k = 0; k < n; k++) dx[i * n + k] += g * px[i * n + k];
         }
-        block_p_ = max_lanes(block_p);
-        block_d_ = max_lanes(block_d);
+        block_p_ = -min_lanes(least_p);
+        block_d_ = -min_lanes(least_d);
         for (int c = 0; c < p; c++) {
             dz[c] += gamma * pz[c];
             for (int side = 0; side < 2; side++) {
                 const int k = 2 * c + side;
                 if (!(zl[k] > 0)) continue;
-                const double du = gamma * (side ? -pz[c] : pz[c]) / zw[k];
+                const double du = gamma * (side ? -pz[c] : pz[c]) * zl[k] * zinv[k];
                 zu[k] += du;
                 zv[k] -= du;
                 block_p_ = max2(block_p_, -zu[k]);
@@ -1184,11 +1204,11 @@ struct BandedIpm : Shape<N, Y> {
         double best = 1e300, ap = 0, ad = 0, free_cost = 1.0;
         for (int c = 0; c < p; c++) free_cost = cz[c] > 0 ? 0.0 : free_cost;
         int since = 0, it = 0;
-        double promised = 1e300, last = 1e300;
+        double promised = 1e300;
         bool kept = false, step = false;
         for (;; it++) {
             if (step) dense_take(ap, ad);
-            assemble(ap, ad, step, true);
+            advance(ap, ad, step);
             step = true;
             const double size = std::fabs(objective) + 1e-6 + free_cost + (set.point == lp_central ? 0.0 : rounding / set.tol);
             const double slip = (dinf - promised) / size;  // what the last direction's dual residual lacks
@@ -1229,6 +1249,7 @@ struct BandedIpm : Shape<N, Y> {
                 return info.status = lp_infeasible;
             }
             if (it >= set.max_iter || !(merit < 1e4 * best || it < 10) || (since >= 8 && best < 1e-5) || since >= 30) break;
+            assemble();
             const double mu = comp / mu_pairs;
             double mu_affine;
             affine(ap, ad, mu_affine);
@@ -1237,13 +1258,11 @@ struct BandedIpm : Shape<N, Y> {
             sigma = sigma < 1.0 ? sigma : 1.0;
             double fraction = max2(0.99, 1.0 - mu);
             if (set.point == lp_central) sigma = max2(sigma, 0.2), fraction = 0.9;
+            // What the affine direction's product would be after a step of which little can be taken is no correction.
             double bp, bd;
-            corrected(sigma * mu, bp, bd);
-// Refinement where the last direction was not accurate, or the path hardly went on.
-            const bool slipped = slip > set.tol && slip > 0.1 * gap, slow = merit > 0.5 * last && merit < 1e-2;
-            const int steps = set.point == lp_central ? 0 : slipped ? 3 : slow ? 2 : 0;
-            last = merit;
-            refine(steps, bp, bd);
+            corrected(sigma * mu, min2(1.0, 2.0 * std::sqrt(ap * ad)), bp, bd);
+            // Refinement where the last direction was not accurate.
+            if (set.point != lp_central && slip > set.tol && slip > 0.1 * gap) refine(3, bp, bd);
             ap = min2(1.0, fraction / max2(bp, 1e-300));
             ad = min2(1.0, fraction / max2(bd, 1e-300));
             promised = (1.0 - ad) * dinf;
@@ -1309,7 +1328,7 @@ struct BandedIpm : Shape<N, Y> {
                     }
                 }
                 for (int c = 0; c < p0; c++) r += lp.G[(t * rows + j) * p0 + c] * out.theta[c];
-                const int g = lp.group[j];
+                const int g = kind(j);
                 const double a = std::fabs(r) / lp.h[j];
                 if (grow) {
                     out.s[g] = max2(out.s[g], a);

@@ -63,6 +63,17 @@ inline Lanes<P> larger(const Lanes<P>& a, const Lanes<P>& b) {
 #endif
     return Lanes<P>::of(a.v > b.v ? a.v : b.v);
 }
+inline double smaller(double a, double b) { return a < b ? a : b; }
+template <int P>
+inline Lanes<P> smaller(const Lanes<P>& a, const Lanes<P>& b) {
+#if defined(__AVX512F__)
+    if constexpr (P == 8) return Lanes<P>::of(typename Lanes<P>::Raw(_mm512_min_pd((__m512d)a.v, (__m512d)b.v)));
+#endif
+#if defined(__AVX__)
+    if constexpr (P == 4) return Lanes<P>::of(typename Lanes<P>::Raw(_mm256_min_pd((__m256d)a.v, (__m256d)b.v)));
+#endif
+    return Lanes<P>::of(a.v < b.v ? a.v : b.v);
+}
 inline double magnitude(double a) { return a < 0 ? -a : a; }
 template <int P>
 inline Lanes<P> magnitude(const Lanes<P>& a) { return larger(a, -a); }
@@ -79,6 +90,8 @@ inline double max_lanes(const Lanes<P>& a) {  // NaN anywhere gives NaN
     for (int p = 1; p < P; p++) s = a.v[p] > s || a.v[p] != a.v[p] ? a.v[p] : s;
     return s;
 }
+template <int P>
+inline double min_lanes(const Lanes<P>& a) { return -max_lanes(-a); }
 // lane p takes the value of lane p-1, lane 0 takes 0: from a stretch to the one before it in time
 template <int P>
 inline Lanes<P> from_before(const Lanes<P>& a) {

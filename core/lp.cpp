@@ -8,16 +8,16 @@ namespace {
 
 constexpr int lanes = 4;
 
-template <int N, int M = 0>
+template <int N, int M = 0, bool Boxed = false>
 struct Run {
     static std::size_t bytes(const LpProblem& lp, const LpSettings& set) {
-        BandedIpm<lanes, N, M> ipm(lp, set);
+        BandedIpm<lanes, N, M, Boxed> ipm(lp, set);
         Carver c{nullptr};
         ipm.carve(c);
         return c.used + 64;
     }
     static int solve(const LpProblem& lp, const LpSettings& set, LpOut& out, void* workspace) {
-        BandedIpm<lanes, N, M> ipm(lp, set);
+        BandedIpm<lanes, N, M, Boxed> ipm(lp, set);
         Carver c{static_cast<char*>(workspace)};
         ipm.carve(c);
         return ipm.solve(out);
@@ -40,10 +40,13 @@ struct Run {
     case 7: return Run<7>::what(__VA_ARGS__);     \
     case 8: return Run<8>::what(__VA_ARGS__);
 #endif
+#define HW_PLAIN(n, m, what, ...)                                                             \
+    if (Shape<n, m, false>::fits(lp)) return Run<n, m, false>::what(__VA_ARGS__);              \
+    if (Shape<n, m, true>::fits(lp)) return Run<n, m, true>::what(__VA_ARGS__);
 #define HW_BY_SIZE(what, ...)                                              \
-    if (Shape<2, 1>::fits(lp)) return Run<2, 1>::what(__VA_ARGS__);        \
-    if (Shape<3, 2>::fits(lp)) return Run<3, 2>::what(__VA_ARGS__);        \
-    if (Shape<4, 2>::fits(lp)) return Run<4, 2>::what(__VA_ARGS__);        \
+    HW_PLAIN(2, 1, what, __VA_ARGS__)                                      \
+    HW_PLAIN(3, 2, what, __VA_ARGS__)                                      \
+    HW_PLAIN(4, 2, what, __VA_ARGS__)                                      \
     switch (lp.n) {                                                        \
         HW_SIZES(what, __VA_ARGS__)                                        \
         default: return Run<0>::what(__VA_ARGS__);                         \

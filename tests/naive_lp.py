@@ -93,7 +93,7 @@ def central(chain, gap=0.3, iterations=50):
         ap, ad = min(1, 1 / max(-u.min(), 1e-300)), min(1, 1 / max(-v.min(), 1e-300))
         mu, affine = w @ lm / len(w), (w * (1 + ap * u)) @ (lm * (1 + ad * v)) / len(w)
         sigma = max(min((affine / mu) ** 3, 1.0), 0.2)
-        zeta = (sigma * mu + w * lm * u * (1 + u)) / w
+        zeta = (sigma * mu + min(1.0, 2 * np.sqrt(ap * ad)) * w * lm * u * (1 + u)) / w
         step = np.linalg.solve(H, -c + J.T @ zeta)
         un = J @ step / w
         vn = -1 - un + zeta / lm

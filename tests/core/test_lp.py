@@ -216,6 +216,39 @@ def test_nothing_is_mutated_and_nan_never_leaves():
             assert np.isfinite(found.objective)
 
 
+def test_a_reduced_answer_is_solved_again_from_where_it_is(monkeypatch):
+    """Of a long record too; what rounding left of large states is then gone."""
+    rng = np.random.default_rng(0)
+    T = 6000
+    x = np.cumsum(rng.uniform(-0.1, 0.1, T))
+    chain = Chain(
+        A=np.eye(1), C=np.eye(1), bx=np.zeros((T, 1)), by=(x + rng.uniform(-0.3, 0.3, T))[:, None],
+        seen=np.ones((T, 1), bool), group=np.arange(2, dtype=np.int32), h=np.ones(2), c=np.ones(2),
+        floor=np.zeros(2), cap=np.full(2, np.inf),
+    )  # fmt: skip
+    best = solve(chain, point="optimal", multipliers=True, fallback=False)
+    assert best.status is Status.OK
+    asked = []
+
+    def early(*args):
+        """The first program is stopped at 1e-7, as one whose numbers hold no more."""
+        asked.append(args)
+        if len(asked) > 1:
+            return _core.lp_solve(*args)
+        *most, start, drop, keep = args
+        most[20] = 1e-4
+        x, theta, s, lam, slack, info = _core.lp_solve(*most, start, drop, keep)
+        return x, theta, s, lam, slack, info | {"status": 1}
+
+    monkeypatch.setattr("halfwidth.solvers.banded.lp_solve", early)
+    ours = solve(chain, point="optimal", multipliers=True)
+    assert len(asked) == 2
+    assert (ours.status, ours.by) == (Status.OK, "banded")
+    assert ours.objective == pytest.approx(best.objective, rel=1e-8)
+    # multipliers in the caller's units: each half-width's add up to its cost
+    np.testing.assert_allclose(ours.multipliers.sum(axis=(0, 2)), chain.c, rtol=1e-6)
+
+
 def test_part_is_the_chain_of_those_rows():
     _, chain, _, _ = problem(2)
     part = chain.part(1, chain.T)

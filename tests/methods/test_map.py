@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -305,6 +306,19 @@ def test_log_objective_descends():
     assert any("on its floor" in n for n in log.info["notes"])
 
 
+def test_log_objective_has_a_central_point():
+    """It is the central point of the program whose optimum the logarithm's is."""
+    model, record, _ = draw(7, T=60, floors=0.05, caps=20.0, F=False)
+    best = hw.estimate(model, record, BatchLP(objective="log", point="optimal")).check()
+    est = hw.estimate(model, record, BatchLP(objective="log")).check()
+    assert est.info["gap"] <= 0.3
+    assert est.info["solver"] == "banded"
+    assert holds(model, record, est)
+    cost = best.info["rows"] / np.r_[best.q, best.r]
+    assert cost @ np.r_[best.q, best.r] < cost @ np.r_[est.q, est.r] < 1.5 * (cost @ np.r_[best.q, best.r])
+    assert est.info["objective"] > best.info["objective"]
+
+
 # --- degenerate cases -----------------------------------------------------------------------------
 
 UNKNOWN = hw.Uniform.unknown(at_most=100.0)
@@ -406,6 +420,46 @@ def test_several_outliers_give_a_span():
     est = hw.estimate(tight, hw.Record(record.t, y), BatchLP(point="least_squares"))
     assert [c["row"] for c in est.info["conflicts"][:2]] == [25, 10]
     assert "between t = " in est.message
+
+
+def fits(model, record, rows):
+    """Whether some trajectory of a model without boxes keeps these rows (kind, name, row), by linprog."""
+    R = residuals(model, record)
+    wide = np.full(R.b.size, np.inf)
+    names = [*model.names.x, *model.names.y]
+    half = np.r_[model.w.at_most * np.ones(R.nx), model.e.at_most * np.ones(R.ny)]
+    for k in range(R.b.size):
+        kind = "state" if R.group[k] < R.nx else "output"
+        if (kind, names[R.group[k]], int(R.row[k])) in rows:
+            wide[k] = half[R.group[k]]
+    held = np.isfinite(wide)
+    M = R.M.toarray()[held]
+    found = scipy.optimize.linprog(
+        np.zeros(M.shape[1]), np.vstack([M, -M]), np.r_[wide[held] + R.b[held], wide[held] - R.b[held]],
+        bounds=(None, None),
+    )  # fmt: skip
+    return found.status == 0
+
+
+def test_rows_that_contradict_each_other_are_the_fewest():
+    for seed, spikes in ((3, {10: 4.0, 25: -5.0}), (2, {17: 3.0}), (4, {0: 2.0, 1: -2.0})):
+        _, record = drift(seed=seed)
+        y = record.y.copy()
+        for row, size in spikes.items():
+            y[row] += size
+        tight = dataclasses.replace(DRIFT, w=hw.Uniform.unknown(at_most=[0.05, 0.02]), e=hw.Uniform(0.3))
+        record = hw.Record(record.t, y)
+        est = hw.estimate(tight, record, BatchLP())
+        assert est.status is hw.Status.INFEASIBLE
+        found = est.info["contradiction"]
+        rows = [(c["kind"], c["name"], c["row"]) for c in found]
+        assert [c["t"] for c in found] == [record.t[c["row"]] for c in found]
+        assert any(kind == "output" and row in spikes for kind, _, row in rows)
+        assert not fits(tight, record, rows)
+        for left_out in rows:
+            assert fits(tight, record, [row for row in rows if row != left_out])
+    # rows far from the outliers are no part of it
+    assert len(rows) < 12
 
 
 def test_boxes_that_contradict_the_caps():

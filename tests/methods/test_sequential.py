@@ -85,6 +85,45 @@ def test_drift_follows_a_parameter_that_moves():
     assert moving.info["objective"] < 0.8 * still.info["objective"]
 
 
+def test_what_the_numbers_do_not_say_is_said():
+    low = hw.Uniform.unknown(at_most=[0.02, 5.0])
+    model = hw.Linear(
+        np.diag([NAN, 0.8]), None, [[1.0, 0.0], [1.0, 0.0]], low, SMALL, None, names=["seen", "hidden"],
+        theta_bounds=(0.5, 1.0),
+    )  # fmt: skip
+    rng = np.random.default_rng(0)
+    x = np.zeros(61)
+    for t in range(60):
+        x[t + 1] = 0.9 * x[t] + rng.uniform(-0.2, 0.2)
+    y = np.c_[x[1:] + rng.uniform(-0.1, 0.1, 60), np.full(60, NAN)]
+    est = hw.estimate(model, hw.Record(np.arange(60.0), y), hw.SequentialLP(point="optimal")).check()
+    assert est.info["on_cap"] == ["q[seen]"]
+    notes = " | ".join(est.info["notes"])
+    assert "bound not identifiable: r[y1]" in notes
+    assert "not observable: hidden" in notes
+    assert "half-width on its cap: q[seen]" in notes
+    assert notes.split(" | ")[0] in est.message
+
+
+def test_infeasible_names_the_rows_and_a_factor_that_is_enough():
+    walk = hw.Linear([[NAN]], None, [[1.0]], hw.Uniform(0.1), hw.Uniform(0.2), None, theta_bounds=(0.9, 1.0))
+    y = np.zeros(30)
+    y[12] = 3.0
+    record = hw.Record(np.arange(30.0), y)
+    est = hw.estimate(walk, record, hw.SequentialLP())
+    assert est.status is hw.Status.INFEASIBLE
+    worst = est.info["conflicts"][0]
+    assert (worst["kind"], worst["name"], worst["row"], worst["t"]) == ("output", "y0", 12, 12.0)
+    assert worst["excess"] == pytest.approx(abs(est.x[12, 0] - 3.0) - 0.2)
+    factor = est.info["inflation"]
+    assert factor > 1.0
+    wider = hw.Linear(
+        [[NAN]], None, [[1.0]], hw.Uniform(1.001 * factor * 0.1), hw.Uniform(1.001 * factor * 0.2), None,
+        theta_bounds=(0.9, 1.0),
+    )  # fmt: skip
+    assert hw.estimate(wider, record, hw.SequentialLP()).status.good
+
+
 def test_a_nonlinear_model():
     def g(x, u):
         return np.stack([x[0] + 0.1 * x[1], x[1] - 0.1 * np.sin(x[0]) + 0.1 * u[0]])

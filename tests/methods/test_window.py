@@ -205,6 +205,47 @@ def test_every_window_is_solved():
         assert est.info["unsolved"] == []
 
 
+def test_sensors_at_several_rates():
+    """A slow sensor's entries stay in the window, and each of the rows between is an estimate."""
+    both = hw.Linear(CART.A.value, CART.B.value, np.eye(2), UNKNOWN, UNKNOWN, None, dt=H)
+    true = dataclasses.replace(both, w=hw.Uniform([0.002, 0.005]), e=hw.Uniform([0.3, 0.05]), x0=hw.Box([0, 0], [0, 0]))
+    truth, record = hw.simulate(true, np.sin(np.arange(300) / 30), seed=4)
+    y = record.y.copy()
+    y[np.arange(300) % 10 != 0, 0] = np.nan  # fixes at 1 Hz
+    y[np.arange(300) % 2 != 0, 1] = np.nan  # speed at 5 Hz
+    slow = hw.Record(record.t, y, record.u)
+    window = hw.Window(hw.BatchLP(), memory=10, fixes=4)
+    est = hw.estimate(both, slow, window).check()
+    for t in range(60, 300):
+        held = slow.seen[est.info["start"][t] : t + 1].sum(axis=0)
+        assert held[0] >= 4
+        assert held[1] >= 11
+    np.testing.assert_array_equal(est.info["extrapolated"], np.arange(300) % 2 == 1)
+    assert np.abs(est.x - truth.x)[60:, 0].mean() < 0.15
+    live = hw.stream(both, window)
+    for t in range(120):
+        newest = live.push(slow.y[t], slow.u[t])
+        np.testing.assert_allclose(newest.x[0], est.x[t], rtol=1e-6, atol=1e-8)
+
+
+def test_theta_drifts_through_a_window():
+    T = 160
+    true = np.linspace(0.3, 0.7, T)
+    x, u, rng = np.zeros(T + 1), np.random.default_rng(0).uniform(-1, 1, T), np.random.default_rng(1)
+    for t in range(T):
+        x[t + 1] = true[t] * x[t] + u[t] + rng.uniform(-0.01, 0.01)
+    small = hw.Uniform.unknown(at_most=1.0)
+    model = hw.Linear([[np.nan]], [[1]], [[1]], small, small, None, theta_bounds=(0, 1))
+    record = hw.Record(np.arange(float(T)), x[1:] + rng.uniform(-0.01, 0.01, T), u)
+    error = []
+    for drift in (None, 0.2):
+        inner = hw.SequentialLP(rounds=1, drift=drift)
+        est = hw.estimate(model, record, hw.Window(inner, memory=40)).check()
+        error.append(np.abs(est.info["theta"][50:, 0] - true[50:]).mean())
+    assert error[1] < 0.7 * error[0]  # the newest value, not the mean of the window
+    assert error[1] < 0.04
+
+
 def test_choose_memory():
     _, record = cart(200)
     choice = hw.choose_memory(CART, record, memories=(3, 10, 20))

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.errors import BadValue
+from halfwidth.methods._infeasible import elastic, inflation
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._residuals import (
     Reference,
@@ -94,9 +95,9 @@ class BatchLP:
         half-width, since it has no minimum otherwise.
     point : {"central", "least_squares", "optimal"}
         ``"central"``: the point of the central path at a relative gap of 0.3, short of the optimum, where states are
-        estimated best. Or a trajectory of the optimal face: that of least squares in units of sigma, inside the
-        optimal half-widths widened by 1e-6 of sigma (1e-4 where that leaves too little room); or the one the solver
-        happens to return.
+        estimated best; of the logarithm, of the program that ends at its optimum. Or a trajectory of the optimal face:
+        that of least squares in units of sigma, inside the optimal half-widths widened by 1e-6 of sigma (1e-4 where
+        that leaves too little room); or the one the solver happens to return.
     grow_caps : bool
         Where the caps ``at_most`` of unknown half-widths leave no trajectory, double them until one fits (step 7 of
         the paper's algorithm); ``info["caps_grown"]`` says how often.
@@ -120,6 +121,7 @@ class BatchLP:
     notes               what the numbers do not say themselves, as sentences
     unobservable        directions of x0 that no output sees, (k, nx)
     conflicts           if infeasible: the rows that cannot be kept, the worst first
+    contradiction       if infeasible: rows that alone contradict each other, none of which can be left out
     inflation           if infeasible: factor on all half-widths that would reconcile them, or None
     caps_grown          factor on the caps, 1 where they were wide enough
     ==================  ======================================================================
@@ -195,29 +197,23 @@ class BatchLP:
         floor, cap = _ends(model)
         # A uniform noise of known half-width q has the standard deviation q / sqrt(3).
         base = reference(rows, model, np.where(floor == cap, floor / math.sqrt(3.0), 0.0))
-        task = _Task.build(rows, base, model, record)
+        task = Task.build(rows, base, model, record)
         solvers = _SOLVERS[self.solver]
         info: dict[str, Any] = {"caps_grown": 1.0}
 
         if self.point == "central" and self.objective != "log":
-            weight = task.weights(self.objective)
-            central = task.central(weight)
-            if central is not None:
-                X, s = task.clipped(central.x.ravel()), np.clip(central.s, floor, np.maximum(cap, floor))
-                info |= task.report(X, s, model, record, self._value(task, s), None)
-                info |= {"solver": central.by, "iterations": central.iterations, "gap": central.gap}
-                if info["notes"]:
-                    info["message"] = "; ".join([Status.OK.value, *info["notes"]])
-                return self._estimate(model, record, X, s, Status.OK, info)
+            est = self._central(model, record, task, task.weights(self.objective), info)
+            if est is not None:
+                return est
 
-        found = self._minimise(task, solvers)
+        found, weight = self._minimise(task, solvers)
         if found.verdict is Verdict.INFEASIBLE and self.grow_caps:
-            factor, _ = task.inflation(solvers, task.free)
+            factor, _ = inflation(task, solvers, task.free)
             if factor is not None:
                 # The doublings of the paper's loop in one go: the first power of two that fits.
                 info["caps_grown"] = 2.0 ** math.ceil(math.log2(factor * (1 + 1e-6)))
                 task = task.grown(info["caps_grown"])
-                found = self._minimise(task, solvers)
+                found, weight = self._minimise(task, solvers)
         if found.verdict is Verdict.INFEASIBLE:
             return self._infeasible(model, record, task, solvers, found, info)
 
@@ -226,6 +222,11 @@ class BatchLP:
             info |= {"solver": found.solver, "notes": list(found.notes), "iterations": found.iterations}
             info["message"] = f"{Status.STALLED.value}: {'; '.join(found.notes)}"
             return self._estimate(model, record, task.clipped(base.X), None, Status.STALLED, info)
+
+        if self.point == "central" and self.objective == "log":
+            est = self._central(model, record, task, weight, info)
+            if est is not None:
+                return est
 
         X, s = task.point(found.x), task.half_widths(found.x)
         if self.point != "optimal" and np.any(found.x[base.X.size :] > _RELAX[0]):
@@ -244,28 +245,43 @@ class BatchLP:
             info["message"] = "; ".join([status.value, *info["notes"]])
         return self._estimate(model, record, X, s, status, info)
 
-    def _minimise(self, task: "_Task", solvers: Sequence[Solver]) -> Solution:
-        """Return the optimal point of the chosen objective."""
+    def _central(
+        self, model: Linear, record: Record, task: "Task", weight: Array, info: dict[str, Any]
+    ) -> Estimate | None:
+        """Return the central point of the program with these costs, or None where the structured solver has none."""
+        central = task.central(weight)
+        if central is None:
+            return None
+        X, s = task.clipped(central.x.ravel()), np.clip(central.s, task.floor, np.maximum(task.cap, task.floor))
+        info |= task.report(X, s, model, record, self._value(task, s), None)
+        info |= {"solver": central.by, "iterations": central.iterations, "gap": central.gap}
+        if info["notes"]:
+            info["message"] = "; ".join([Status.OK.value, *info["notes"]])
+        return self._estimate(model, record, X, s, Status.OK, info)
+
+    def _minimise(self, task: "Task", solvers: Sequence[Solver]) -> tuple[Solution, Array]:
+        """Return the optimal point of the chosen objective, and the costs that it is optimal for."""
         weight = task.weights("paper" if self.objective == "paper" else "scaled")
         program = task.program(weight)
         found = solve(program, solvers)
         if self.objective != "log" or found.x is None:
-            return found
+            return found, weight
         # The tangent of the logarithm lies above it, so each program lowers sum N log s.
         count = task.rows.count / max(float(task.rows.count.max()), 1.0)
         n = task.rows.M.shape[1]
         s = np.maximum(found.x[n:], task.lowest)
         for _ in range(_ROUNDS):
             cost = np.where(task.free, count / np.where(task.free, s, 1.0), 0.0)
-            again = solve(replace(program, c=np.r_[np.zeros(n), cost / max(float(cost.max()), 1e-300)]), solvers)
+            cost = cost / max(float(cost.max()), 1e-300)
+            again = solve(replace(program, c=np.r_[np.zeros(n), cost]), solvers)
             if not again.solved or again.x is None:
                 break
-            last, s, found = s, np.maximum(again.x[n:], task.lowest), again
+            last, s, found, weight = s, np.maximum(again.x[n:], task.lowest), again, cost
             if np.max(np.abs(s - last) / np.where(task.free, last, 1.0), initial=0.0) < 1e-6:
                 break
-        return found
+        return found, weight
 
-    def _value(self, task: "_Task", s: Array) -> float:
+    def _value(self, task: "Task", s: Array) -> float:
         """Return the objective in the units of its definition."""
         there = task.rows.count > 0
         if self.objective == "paper":
@@ -279,16 +295,15 @@ class BatchLP:
         self,
         model: Linear,
         record: Record,
-        task: "_Task",
+        task: "Task",
         solvers: Sequence[Solver],
         found: Solution,
         info: dict[str, Any],
     ) -> Estimate:
         """Say which rows conflict, and what would reconcile them."""
-        factor, inflated = task.inflation(solvers, np.ones_like(task.free))
+        factor, inflated = inflation(task, solvers, np.ones_like(task.free))
         capped = bool(np.any(task.free & np.isfinite(task.highest)))
-        excess, least = task.elastic(solvers)
-        conflicts = [] if excess is None else task.conflicts(excess, model, record)
+        least, conflicts, contradiction = elastic(task, solvers, model, record)
         X = next((v for v in (inflated, least) if v is not None), task.base.X)
         message = Status.INFEASIBLE.value
         if conflicts:
@@ -300,6 +315,7 @@ class BatchLP:
         info |= {
             "message": message,
             "conflicts": conflicts,
+            "contradiction": contradiction,
             "inflation": factor,
             "solver": found.solver,
             "iterations": found.iterations,
@@ -344,7 +360,7 @@ def _unknown(model: Linear) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Task:
+class Task:
     """The program in scaled form: ``X = X_ref + column xi``, ``s = sigma s^``, rows ``|M xi + rho| <= S s^``.
 
     Parameters
@@ -385,7 +401,7 @@ class _Task:
     chain: Chain | None
 
     @classmethod
-    def build(cls, rows: Residuals, base: Reference, model: Linear, record: Record) -> "_Task":
+    def build(cls, rows: Residuals, base: Reference, model: Linear, record: Record) -> "Task":
         """Scale the rows, boxes, floors and caps."""
         import scipy.sparse as sp
 
@@ -429,7 +445,7 @@ class _Task:
         mean = float(count[count > 0].mean()) if np.any(count > 0) else 1.0
         return np.where(self.free, count / mean, 0.0)
 
-    def grown(self, factor: float) -> "_Task":
+    def grown(self, factor: float) -> "Task":
         """Return the task with the caps of unknown half-widths multiplied."""
         more = np.where(self.free, factor, 1.0)
         return replace(self, highest=more * self.highest, cap=more * self.cap)
@@ -504,68 +520,6 @@ class _Task:
             floor=1e-3,
         )
 
-    def inflation(self, solvers: Sequence[Solver], grow: NDArray[np.bool_]) -> tuple[float | None, Array | None]:
-        """Return the least common factor on the half-widths that fits a trajectory, and that trajectory.
-
-        The caps of unknown half-widths grow, and known ones where `grow` says so; half-widths without a cap bound
-        nothing.
-        """
-        import scipy.sparse as sp
-
-        limit = np.where(self.free, self.highest, self.lowest)
-        bounded = np.asarray(self.S @ np.isinf(limit).astype(float)) == 0
-        finite = np.where(np.isfinite(limit), limit, 0.0)
-        M, S, rho = self.M[bounded], self.S[bounded], self.rho[bounded]
-        growing, fixed = S @ (finite * grow), S @ (finite * ~grow)
-        if not np.any(growing > 0):
-            return None, None
-        unit = float(np.median(growing[growing > 0]))
-        column = sp.csr_array(growing[:, None] / unit)
-        none = np.full(rho.size, np.inf)
-        found = solve(
-            Program(
-                c=np.r_[np.zeros(self.M.shape[1]), 1.0],
-                G=sp.csr_array(sp.vstack([sp.hstack([M, column]), sp.hstack([M, -column])])),
-                row_lo=np.r_[-rho - fixed, -none],
-                row_hi=np.r_[none, fixed - rho],
-                lo=np.r_[self.lo, 0.0],
-                hi=np.r_[self.hi, np.inf],
-                floor=1e-3 * unit,
-            ),
-            solvers,
-        )
-        if not found.solved or found.x is None:
-            return None, None
-        return float(found.x[-1]) / unit, self.point(found.x)
-
-    def elastic(self, solvers: Sequence[Solver]) -> tuple[Array | None, Array | None]:
-        """Return the least total excess of the rows over their caps, (K,) in units of sigma, and its trajectory."""
-        import scipy.sparse as sp
-
-        n = self.M.shape[1]
-        limit = np.where(self.free, self.highest, self.lowest)
-        picked = np.flatnonzero(np.asarray(self.S @ np.isinf(limit).astype(float)) == 0)
-        M, rho, k = self.M[picked], self.rho[picked], picked.size
-        wide = self.S[picked] @ np.where(np.isfinite(limit), limit, 0.0)
-        unit, none = sp.eye_array(k), np.full(k, np.inf)
-        found = solve(
-            Program(
-                c=np.r_[np.zeros(n), np.ones(k)],
-                G=sp.csr_array(sp.vstack([sp.hstack([M, unit]), sp.hstack([M, -unit])])),
-                row_lo=np.r_[-wide - rho, -none],
-                row_hi=np.r_[none, wide - rho],
-                lo=np.r_[self.lo, np.zeros(k)],
-                hi=np.r_[self.hi, none],
-                floor=1e-3,
-            ),
-            solvers,
-        )
-        if not found.solved or found.x is None:
-            return None, None
-        excess = np.zeros(self.rho.size)
-        excess[picked] = found.x[n:]
-        return excess, self.point(found.x)
-
     def clipped(self, X: Array) -> Array:
         """Return the trajectory moved into its boxes."""
         return np.clip(X, self.x_lo, self.x_hi)
@@ -632,25 +586,6 @@ class _Task:
             "notes": notes,
             "unobservable": blind,
         }
-
-    def conflicts(self, excess: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
-        """Return the rows that exceed their bounds, the worst first."""
-        rows = self.rows
-        order = np.argsort(-excess, kind="stable")
-        found = []
-        for k in order[excess[order] > _ZERO]:
-            j, t = int(rows.group[k]), int(rows.row[k])
-            state = j < rows.nx
-            found.append(
-                {
-                    "t": float(record.t[t]),
-                    "row": t,
-                    "kind": "state" if state else "output",
-                    "name": model.names.x[j] if state else model.names.y[j - rows.nx],
-                    "excess": float(excess[k] * (rows.S[[int(k)]] @ self.base.sigma)[0]),
-                }
-            )
-        return found
 
 
 def _up(factor: float) -> float:

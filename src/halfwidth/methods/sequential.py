@@ -35,7 +35,7 @@ import numpy as np
 from halfwidth.array import Array, real
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.methods._protocol import typed
-from halfwidth.methods._residuals import reference, residuals
+from halfwidth.methods._residuals import reference, residuals, unseen_directions
 from halfwidth.model import Entry, Linear, Model, Nonlinear, arity, needs_a_box
 from halfwidth.noise import Gaussian, Uniform
 from halfwidth.record import Record
@@ -69,7 +69,7 @@ class SequentialLP:
     objective : {"scaled", "paper", "log"}
         ``sum N_j s_j / sigma_j`` with the noise level sigma_j of a least-squares fit, the paper's ``sum s_j``, or
         ``sum N_j ln s_j``, which starts at the scaled optimum and needs ``at_least`` above 0 for every unknown
-        half-width; ``info["on_floor"]`` names those that end there.
+        half-width; ``info["on_floor"]`` names those that end there, ``info["on_cap"]`` those at ``at_most``.
     point : {"central", "least_squares", "optimal"}
         Central points follow the central path to a relative gap of 0.3; they estimate better than optimal ones. For
         the logarithm the path is that of the program at its optimum. Least squares is taken inside the optimal
@@ -84,6 +84,12 @@ class SequentialLP:
         Where to start; 0 moved into the bounds if absent.
     start : (T + 1, nx) array_like or None
         Trajectory to start from; of least squares, or of an extended Kalman smoother, if absent.
+
+    Notes
+    -----
+    ``info["notes"]`` says what the numbers do not: half-widths on a floor or a cap or without a row, states that no
+    output sees. Where no trajectory was found within the caps, ``info["conflicts"]`` lists the rows beyond them, the
+    worst first, and ``info["inflation"]`` is the factor on all half-widths with which the trajectory returned fits.
 
     Raises
     ------
@@ -731,18 +737,28 @@ def finished(method: SequentialLP, model: Model, record: Record, rows: Rows, at:
     rho = rows.residuals(x, theta)
     s = largest(rho, rows.floor)
     over = s > rows.cap * (1.0 + 1e-6)
-    notes = []
+    notes: list[str] = []
+    refuted: dict[str, Any] = {}
     if status is Status.INFEASIBLE:
         notes.append("this is the trajectory of least excess over the caps that was found")
+        refuted = _excess(model, record, rows, rho)
     if over.any() and status.good:
         status = Status.REDUCED
         notes.append("the linearisation leaves residuals beyond the caps")
     free = rows.floor < rows.cap
     kinds = [f"q[{name}]" for name in model.names.x] + [f"r[{name}]" for name in model.names.y]
-    low = free & (rows.floor > 0) & (s <= _ON_FLOOR * rows.floor) & np.isfinite(rho).any(axis=0)
-    on_floor = [name for name, here in zip(kinds, low, strict=True) if here]
-    if on_floor:
-        notes.append(f"half-width on its floor: {', '.join(on_floor)}")
+    there = np.isfinite(rho).any(axis=0)
+    low = free & (rows.floor > 0) & (s <= _ON_FLOOR * rows.floor) & there
+    high = free & there & (s >= rows.cap * (1.0 - 1e-6))
+    on_floor, on_cap, blind = (
+        [name for name, here in zip(kinds, mask, strict=True) if here] for mask in (low, high, free & ~there)
+    )
+    for what, named in (
+        ("bound not identifiable", blind), ("half-width on its floor", on_floor), ("half-width on its cap", on_cap),
+        ("not observable", _unobservable(rows, model, theta) if status.good else []),
+    ):  # fmt: skip
+        if named:
+            notes.append(f"{what}: {', '.join(named)}")
     n = len(rows.entries)
     count = np.where(free, np.isfinite(rho).sum(axis=0), 0)
     log = float(count[count > 0] @ np.log(s[count > 0])) if method.objective == "log" else None
@@ -755,10 +771,11 @@ def finished(method: SequentialLP, model: Model, record: Record, rows: Rows, at:
         "e": -rho[:, rows.nx :],
         "rows": count,
         "on_floor": on_floor,
+        "on_cap": on_cap,
         "notes": notes,
         "iterations": 0 if answer is None else answer.iterations,
         "solver": "banded" if answer is None else answer.by,
-    }
+    } | refuted
     if method.drift is not None and n:
         info["drift"] = theta[n:].copy()
     if notes:
@@ -776,3 +793,31 @@ def finished(method: SequentialLP, model: Model, record: Record, rows: Rows, at:
         labels=record.labels,
         info=info,
     )
+
+
+def _unobservable(rows: Rows, model: Model, theta: Array) -> list[str]:
+    """Return the states of a linear model that no seen output tells apart, at this theta."""
+    if not isinstance(rows, LinearRows):
+        return []
+    fixed = filled(rows.model, theta[: len(rows.entries)])
+    blind = unseen_directions(residuals(fixed, rows.clean), fixed, rows.clean)
+    involved = np.abs(blind).max(axis=0, initial=0.0) > 1e-6
+    return [name for name, lost in zip(model.names.x, involved, strict=True) if lost]
+
+
+def _excess(model: Model, record: Record, rows: Rows, rho: Array) -> dict[str, Any]:
+    """Return the rows beyond their caps, the worst in units of the cap first, and the factor with which they fit."""
+    size = np.abs(np.where(np.isfinite(rho), rho, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(size > rows.cap, size / rows.cap, 0.0)
+    t, j = np.nonzero(ratio > 1.0 + _NONE)
+    names = [*model.names.x, *model.names.y]
+    conflicts = [
+        {
+            "t": float(record.t[t[k]]), "row": int(t[k]), "kind": "state" if j[k] < rows.nx else "output",
+            "name": names[j[k]], "excess": float(size[t[k], j[k]] - rows.cap[j[k]]),
+        }
+        for k in np.argsort(-ratio[t, j], kind="stable")
+    ]  # fmt: skip
+    factor = float(ratio.max(initial=0.0))
+    return {"conflicts": conflicts, "inflation": factor if np.isfinite(factor) and factor > 1.0 else None}

@@ -331,10 +331,10 @@ def tables(*, quick: bool = False) -> tuple[Table, ...]:
 
 
 def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.Path]:
-    """Draw figures 1 to 3 into a folder; returns the files.
+    """Draw figures 1 to 3 and table I into a folder; returns the files.
 
     Figure 1 shows the estimate of F12 over time, figure 2 the interval of the third state, figure 3 the time of a row
-    against the number of states.
+    against the number of states; table I is drawn with the paper's values beside ours.
     """
     import matplotlib as mpl
 
@@ -389,6 +389,25 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
     ax.set(xlabel="states", ylabel="ms a row", title="Figure 3: time of a row")
     ax.legend()
     files.append(folder / "paper003_figure3.png")
+    figure.savefig(files[-1], dpi=120, bbox_inches="tight")
+    plt.close(figure)
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3))
+    memories = (5, 10, 25) if quick else (5, 10, 15, 25, 50)
+    ours = [experiment(memory, range(1), unknown=True, correlated=True, rows=rows)[0] for memory in memories]
+    left.plot(TABLE_I.keys(), [row[0] for row in TABLE_I.values()], "ks", fillstyle="none", label="paper")
+    left.plot(memories, [1e3 * one.V for one in ours], "o-", label="ours")
+    left.set(xlabel="memory", ylabel="V x 1e3", title="Table I: volume", ylim=(0, None))
+    for k, kappa in enumerate(KAPPA):
+        right.plot(TABLE_I.keys(), [row[1 + k] for row in TABLE_I.values()], "s", color=f"C{k}", fillstyle="none")
+        right.plot(memories, [one.joint[k] for one in ours], "-", color=f"C{k}", label=f"kappa {kappa}, any entry")
+        right.plot(memories, [one.entry[k] for one in ours], ":", color=f"C{k}")
+    right.set(
+        xlabel="memory", ylabel="outside, %", title="Table I: N; squares: paper, dotted: by entry", ylim=(0, None)
+    )
+    left.legend()
+    right.legend(fontsize=7)
+    files.append(folder / "paper003_table1.png")
     figure.savefig(files[-1], dpi=120, bbox_inches="tight")
     plt.close(figure)
     return files
