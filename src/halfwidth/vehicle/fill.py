@@ -159,8 +159,7 @@ def fill(
     answers = _estimated(pieces, chosen, spans, level, messages, free=free)
     columns = _read(answers, pieces, t)
     away = _distance_in_time(drive_log, t)
-    z = NormalDist().inv_cdf(0.5 + level / 2)
-    half = _half_widths(columns, answers, grid, away, z, t, quality)
+    half = _half_widths(columns, answers, grid, away, level, t, quality)
     arm_east, arm_north = sensors.arm(t)
     east, north = columns.east + arm_east, columns.north + arm_north
     lat, lon = grid.frame.to_geodetic(east, north)
@@ -872,16 +871,19 @@ def _half_widths(
     answers: _Answers,
     grid: Grid,
     away: Floats,
-    z: float,
+    level: float,
     t: Floats,
     quality: NDArray[np.str_],
 ) -> Floats:
     """Return the half-widths (M, 2), m: the model's, widened as tested, and no wider than a vehicle can go."""
-    factor = np.ones(away.size)
+    z = NormalDist().inv_cdf(0.5 + level / 2)
+    sd = np.sqrt(columns.variance + columns.fix_variance[:, None])
+    half = z * sd
     for bridge in answers.bridges:
         rows = (quality != "fix") & (t >= bridge.span.start) & (t <= bridge.span.stop)
-        factor[rows] = calibrate.inflation(bridge.tested, np.array([bridge.span.length]), least=bridge.least)
-    half = z * factor[:, None] * np.sqrt(columns.variance + columns.fix_variance[:, None])
+        for axis in (0, 1):
+            own = sd[rows, axis]
+            half[rows, axis] *= calibrate.inflation(bridge.tested, bridge.span.length, own, level, least=bridge.least)
     # twice: both the estimate and the vehicle are within reach of the nearest fix
     limit = 2 * _top_speed(grid) * away + z * np.sqrt(columns.fix_variance) + 10.0
     return np.minimum(half, limit[:, None])
