@@ -69,6 +69,7 @@ def one_run(log, begins, length, truth=None):
         if truth is not None:
             when = track.t_s[at] - truth.clock_offset  # the track is on the clock of the fixes
             one["true"] = np.column_stack(truth.error_m(when, track.lat_deg[at], track.lon_deg[at]))
+            one["truth_half"] = half if track.truth_half_m is None else track.truth_half_m[at]
         found.append(one)
     return found
 
@@ -91,7 +92,9 @@ def row(name, length, gaps, drives, room, level, seconds, truths):
     text = f"{name:>8} {length:>4g} s{len(gaps):>6}{room:>7.0f}{mean:>9.2f}{share:>8.3f} +- {error:.3f}"
     text += f"{np.median(half):>9.2f}{score:>9.2f}{seconds:>8.2f}"
     if truths:
-        text += f"{np.mean([np.mean(np.abs(g['true']) <= g['half']) for g in gaps]):>9.3f}"
+        for key in ("half", "truth_half"):
+            text += f"{np.mean([np.mean(np.abs(g['true']) <= g[key]) for g in gaps]):>9.3f}"
+        text += f"{np.median(np.concatenate([g['truth_half'] for g in gaps])):>9.2f}"
     print(text, flush=True)
 
 
@@ -141,7 +144,7 @@ def drives(count, seed):
 
 def on_drives(count, lengths, wanted, seed):
     """Print the table of simulated drives, each length over all of them."""
-    print(HEAD + f"{'truth':>9}")
+    print(HEAD + f"{'truth':>9}{'in t.h.':>9}{'t.h. m':>9}")
     made = list(drives(count, seed))
     for length in lengths:
         gaps, which, seconds, room = [], [], [], 0.0
