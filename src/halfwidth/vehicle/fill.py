@@ -36,6 +36,7 @@ from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path, sized
 from halfwidth.vehicle.roads import roads_of
 from halfwidth.vehicle.slow import Slow, slow_error
+from halfwidth.vehicle.spikes import spikes
 from halfwidth.vehicle.stray import strays
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
 
@@ -95,8 +96,9 @@ def fill(
         Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; found from
         the log, for each by itself, if absent.
     distrust : bool
-        Whether fixes that only repeat the one before while the car moves are found and bridged; the track's messages
-        name them.
+        Whether samples are looked for that are not what they claim, and left out: fixes that only repeat the one
+        before while the car moves or lie where it cannot have been, speeds and yaw rates that leap away and come back.
+        The track's messages name them.
     second : Log, path or frame, optional
         Fixes of a second antenna, on the clock of the first one's. This, `roads` and `limits` are for the two-antenna
         model, which is the method where one of them is given and `method` is absent.
@@ -137,7 +139,12 @@ def fill(
         raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
     messages: list[str] = []
     if distrust:
-        doubtful = distrusted(drive_log, jumps=False)  # stray ones show against speed and yaw rate, later
+        leaps = spikes(drive_log)
+        messages.extend(leaps.words(drive_log))
+        drive_log = leaps.masked(drive_log)
+        # stray fixes show best against speed and yaw rate, later
+        sensed = all(np.isfinite(getattr(drive_log, name)).any() for name in ("speed_mps", "yaw_rate_radps"))
+        doubtful = distrusted(drive_log, jumps=not sensed)
         messages.extend(doubtful.words(drive_log))
         drive_log = doubtful.masked(drive_log)
     drive_log = _with_pauses_filled(drive_log, messages)
