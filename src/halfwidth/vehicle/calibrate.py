@@ -42,7 +42,10 @@ Floats = NDArray[np.float64]
 #: and stretches that are enough without another one.
 MOST_LENGTHS, RATIO, PHASES, ENOUGH = 5, 2.0, 3, 40
 
-#: Fixes left between hidden stretches and at the ends, s, at least; and stretches of all lengths that are a test.
+#: Fixes that a log needs for a test.
+FEWEST_FIXES = 16
+
+#: Fixes left between hidden stretches and at the ends, s, at least; and stretches of one length that are a test.
 BETWEEN, EDGE, FEWEST = 15.0, 3.0, 3
 
 #: Windows cut out of a log to test how far off a path gets beyond the last fix, about, and their fixes, s.
@@ -55,12 +58,16 @@ MOST_NODES = 20_000
 #: vehicle did is guessed, so that one wrong guess makes all of the stretch wrong.
 _PER_STRETCH, _PER_GUESS = 4, 1
 
-#: Groups of hidden fixes of one length.
+#: Groups of hidden fixes of one length; one where what the vehicle did is guessed.
 GROUPS = 4
 
-#: Standard deviations of the logarithm of the factor before anything is tested: of its size, and of its change with the
-#: stated standard deviation and with the length; the change in either's logarithm over which these are felt.
-_SIZE, _BY_SD, _BY_LENGTH, _FELT = 1.0, 0.4, 0.15, 1.5
+#: Standard deviations of the logarithm of the factor before anything is tested: of its size, of its change with the
+#: stated standard deviation and of that with the length, where sensors carry the path and where what the vehicle did is
+#: guessed; the change in either's logarithm over which these are felt.
+_SIZE, _BY_SD, _BY_LENGTH, _BY_GUESS, _FELT = 1.0, 0.4, 0.2, 0.6, 1.5
+
+#: Most that the noise of two groups has in common.
+_SHARED = 0.95
 
 #: Least degrees of freedom of Student's distribution.
 _FEWEST_DEGREES = 2.5
@@ -108,6 +115,8 @@ class Tested:
     asked : tuple of (float, float, float)
         For each group of hidden fixes its standard deviation, m, the factor that it asks for by itself, and how many
         independent errors that rests on.
+    guessed : bool
+        Whether what the vehicle did was guessed for lack of a sensor: longer gaps are then another thing.
     """
 
     length_s: float
@@ -121,6 +130,7 @@ class Tested:
     half_m: float = 0.0
     side: str = "both"
     asked: tuple[tuple[float, float, float], ...] = ()
+    guessed: bool = False
 
 
 def lengths_to_test(drives: Sequence[Grid], gaps: Floats) -> list[float]:
@@ -139,6 +149,8 @@ def lengths_to_test(drives: Sequence[Grid], gaps: Floats) -> list[float]:
     """
     spans = [np.ptp(drive.t[drive.seen]) for drive in drives if drive.seen.any()]
     if not spans or gaps.size == 0:
+        return []
+    if sum(int(drive.seen.sum()) for drive in drives) < FEWEST_FIXES:
         return []
     steps = [float(np.median(np.diff(drive.t[drive.seen]))) for drive in drives if drive.seen.sum() > 1]
     if not steps:
@@ -215,12 +227,12 @@ def tested(
         for by, paths in rerun([case[0] for case in cases], [case[2] for case in cases]).items():
             one = _judged(cases, paths, length, level, z, _PER_GUESS if guessed else _PER_STRETCH, room)
             if one is not None:
-                by_way.setdefault(by, []).append(replace(one, silent=silent, by=by))
+                by_way.setdefault(by, []).append(replace(one, silent=silent, by=by, guessed=guessed))
     return {by: _sized(found, level) for by, found in by_way.items() if _enough(found)}
 
 
 def _enough(found: Sequence[Tested]) -> bool:
-    return sum(one.stretches for one in found) >= FEWEST
+    return max((one.stretches for one in found), default=0) >= FEWEST
 
 
 def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -> tuple[Grid, list[slice]] | None:
@@ -298,7 +310,7 @@ def tested_ends(
         if len(cases) >= FEWEST:
             paths = rerun([case[0] for case in cases], [case[2] for case in cases])
             one = _judged(cases, paths, length, level, z, _PER_GUESS, np.inf)
-            found += [] if one is None else [replace(one, silent=silent, by=by, side="one")]
+            found += [] if one is None else [replace(one, silent=silent, by=by, side="one", guessed=True)]
     return _sized(found, level) if _enough(found) else []
 
 
@@ -348,18 +360,18 @@ def _judged(
         float(np.mean(inside)),
         1.0,
         half_m=float(np.mean(halves)),
-        asked=_asked(factors, sds, level, errors),
+        asked=_asked(factors, sds, level, errors, GROUPS if independent == _PER_STRETCH else 1),
     )
 
 
 def _asked(
-    needed: Sequence[Floats], sds: Sequence[Floats], level: float, errors: float
+    needed: Sequence[Floats], sds: Sequence[Floats], level: float, errors: float, groups: int
 ) -> tuple[tuple[float, float, float], ...]:
     """Divide hidden fixes by their standard deviations, and say what each group asks for; see `Tested.asked`."""
     sd, factor = np.concatenate(sds), np.concatenate(needed)
     weight = np.concatenate([np.full(one.size, 1.0 / (len(needed) * one.size)) for one in needed])
     order = np.argsort(sd, kind="stable")
-    group = np.minimum(np.cumsum(weight[order]) * GROUPS * (1 - 1e-9), GROUPS - 1).astype(int)
+    group = np.minimum(np.cumsum(weight[order]) * groups * (1 - 1e-9), groups - 1).astype(int)
     found = []
     for k in np.unique(group):
         mine = order[group == k]
@@ -463,21 +475,27 @@ def inflation(found: Sequence[Tested], length: float, sd: Floats, level: float, 
     at = np.log(np.column_stack((np.maximum(sds, 1e-9), lengths)))
     to = np.log(np.column_stack((np.maximum(sd, 1e-9), np.full(np.shape(sd), max(length, 1e-3)))))
     z = _z(level)
+    by_length = _BY_GUESS if any(one.guessed for one in found) else _BY_LENGTH
     noise = np.sqrt(level * (1 - level) / errors) / (2 * z * NormalDist().pdf(z))
 
     def apart(x: Floats, y: Floats) -> Floats:
         return np.abs(x[:, None] - y)  # of sd and of length, (n, m, 2)
 
     def alike(x: Floats, y: Floats) -> Floats:
-        return np.asarray(_SIZE**2 + np.exp(-apart(x, y) / _FELT) @ np.array([_BY_SD**2, _BY_LENGTH**2]))
+        return np.asarray(_SIZE**2 + np.exp(-apart(x, y) / _FELT) @ np.array([_BY_SD**2, by_length**2]))
 
-    seen = alike(at, at) + np.outer(noise, noise) * np.exp(-apart(at, at).sum(axis=-1))
+    shared = _SHARED * np.exp(-apart(at, at).sum(axis=-1)) + (1 - _SHARED) * np.eye(noise.size)
+    seen = alike(at, at) + np.outer(noise, noise) * shared
     cross = alike(at, to)
     known = np.linalg.solve(seen, cross)
-    variance = _SIZE**2 + _BY_SD**2 + _BY_LENGTH**2 - np.einsum("ij,ij->j", known, cross)
+    variance = _SIZE**2 + _BY_SD**2 + by_length**2 - np.einsum("ij,ij->j", known, cross)
     degrees = np.maximum(0.5 / np.maximum(variance, 1e-9), _FEWEST_DEGREES)
     factor = np.exp(np.log(np.maximum(asked, LEAST)) @ known) * _student(level, degrees) / z
-    return np.asarray(np.maximum(factor, max(least, LEAST)))
+    half = np.maximum(factor, max(least, LEAST)) * sd
+    # what is stated to be less sure is not shown as surer
+    order = np.argsort(sd, kind="stable")
+    half[order] = np.maximum.accumulate(half[order])
+    return np.asarray(half / np.maximum(sd, 1e-300))
 
 
 def _z(level: float) -> float:

@@ -260,8 +260,8 @@ def _pauses(log: Log) -> Item:
 def _spikes(log: Log) -> tuple[Item, Log]:
     """Look for speeds and yaw rates that leap away and come back; return the log without them."""
     found = spikes(log)
-    if not found.rows:
-        return Item("spikes", "ok", "no speed or yaw rate leaps away and comes back", 0.0), log
+    if not len(found):
+        return Item("spikes", "ok", "no speed or yaw rate leaps away and comes back, or is stuck", 0.0), log
     said = "; ".join(words.removesuffix(": not used") for words in found.words(log))
     item = Item("spikes", "warn", said, float(len(found)), line=check_sensors.fill_line(log))
     return item, found.masked(log)
