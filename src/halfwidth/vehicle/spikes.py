@@ -117,8 +117,15 @@ def spikes(log: Log) -> Spikes:
         begin = np.flatnonzero(np.concatenate(([True], np.diff(values) != 0)))
         end = np.concatenate((begin[1:], [values.size])) - 1
         long = (end - begin + 1 >= _STUCK) & (t[end] - t[begin] >= _STUCK_S)
+        first, last = begin[long], end[long]
         leaps = np.concatenate(([False], leap, [False]))
-        runs = [rows[a : b + 1] for a, b in zip(begin[long], end[long], strict=True) if leaps[a] or leaps[b + 1]]
+        before, after = leaps[first], leaps[last + 1]
+        # a car that stands next to a stretch that is stuck: the leap is the other one's
+        stands = (values[first] == 0) & (
+            (before & ~after & np.isin(first - 1, last)) | (after & ~before & np.isin(last + 1, first))
+        )
+        odd = (before | after) & ~stands
+        runs = [rows[a : b + 1] for a, b in zip(first[odd], last[odd], strict=True)]
         if runs and sum(run.size for run in runs) <= _MANY_STUCK * rows.size:
             stuck[name] = runs
     return Spikes(found, stuck)
