@@ -64,7 +64,7 @@ def test_a_slow_error_of_the_receiver_is_named_and_in_the_half_widths_about_the_
         assert found < 2.5 * size
         assert size < 1.0 or found > 0.4 * size
         assert any("not where it was" in message for message in track.messages)
-        assert size < 1.0 or any("for a minute at a time" in message for message in track.messages)
+        assert size < 1.0 or any("for minutes at a time" in message for message in track.messages)
         at = np.searchsorted(made.t, track.t_s)
         off = np.abs(
             np.column_stack(FRAME.to_local(track.lat_deg, track.lon_deg))

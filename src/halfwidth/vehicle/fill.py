@@ -8,7 +8,7 @@ where they speak, the chain whose fixes are wrong by white noise only competes i
 piece is replaced by a simpler one there, and the track says so.
 
 Positions are those that the receiver would have reported, and the half-widths say how far off they are: hidden fixes
-lie within them as often as `level` says, on this log. What the receiver is wrong by for a minute at a time is in the
+lie within them as often as `level` says, on this log. What the receiver is wrong by for minutes at a time is in the
 fixes on both sides of a gap and in the filling between them, and hiding fixes cannot show it. How large that slow error
 is shows in how fixes and dead reckoning disagree (`slow`): the messages name it, and `Track.truth_half_m` has it.
 
@@ -686,9 +686,9 @@ def _slow_words(slow: Slow) -> str:
     """Say what the half-widths are about, and how far off that the truth may be."""
     promise = "the half-widths hold where the receiver would have seen the vehicle, not where it was"
     if not slow.seen:
-        return f"{promise}; no error of the fixes that lasts for a minute shows in the drive"
+        return f"{promise}; no error of the fixes that lasts for minutes shows in the drive"
     return (
-        f"{promise}: the fixes are wrong by {slow.sd:.2g} m for a minute at a time (1 sigma, as they and the sensors"
+        f"{promise}: the fixes are wrong by {slow.sd:.2g} m for minutes at a time (1 sigma, as they and the sensors"
         " disagree), which hiding fixes cannot show; `truth_half_m` of the track has it"
     )
 

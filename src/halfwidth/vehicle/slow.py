@@ -1,4 +1,4 @@
-"""What all fixes around a gap share: how far the receiver itself is off, for as long as a minute at a time.
+"""What all fixes around a gap share: how far the receiver itself is off, for minutes at a time.
 
 Hiding fixes shows where the receiver would have seen the vehicle, not where the vehicle was. But a receiver whose error
 wanders does not agree with dead reckoning, and that is in the log: the chain with Gaussian increments of the fix offset
@@ -6,8 +6,9 @@ wanders does not agree with dead reckoning, and that is in the log: the chain wi
 maximisation moves this scale so slowly that it stays near where it began (measured: 0.8 to 1.3 m for true errors of
 0.04 to 0.5 m, where the largest likelihood finds 0.08 to 0.5 m).
 
-How long an error lasts is not in the log: a receiver that is off by the same all along agrees with itself. The chain's
-60 s are an assumption, and an error that lasts for many minutes is only found in part. And what the sensors are wrong
+How long an error lasts is not in the log: a receiver that is off by the same all along agrees with itself. `MEMORY` is an
+assumption, twice the chain's 60 s to be rather too wide than too narrow; an error that lasts longer is only found in
+part. And what the sensors are wrong
 by for as long as that is taken for the fixes' error: on logs with poor sensors the number is too large, not too small.
 """
 
@@ -28,6 +29,9 @@ _FINE = (0.5, 2.0)
 
 #: Rounds of the chain for each, and nodes on which they are compared, about.
 _ROUNDS, _NODES = 2, 4000
+
+#: How long an error is taken to last, s.
+MEMORY = 120.0
 
 #: Logarithm of the likelihood by which an offset has to be better than next to none.
 _CLEAR = 2.0
@@ -76,7 +80,7 @@ def slow_error(grids: Sequence[Grid], fits: Sequence[chain.Fit], shown: Sequence
     Slow or None
         None where the numbers broke down.
     """
-    settings = chain.Chain(rounds=_ROUNDS, tail=np.inf, drifting=False)
+    settings = chain.Chain(rounds=_ROUNDS, tail=np.inf, drifting=False, memory=MEMORY)
     found: dict[float, float] = {}
     enough = max(1, int(np.searchsorted(np.cumsum([len(grid) for grid in grids]), _NODES)))
 

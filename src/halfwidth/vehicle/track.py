@@ -6,7 +6,7 @@ is needed to reproduce it; it is a value and never changes. The half-widths are 
 interval at `level`, separately for east and north: the position that the receiver would have
 reported is claimed to lie within ``lat, lon`` plus or minus ``east_half_m, north_half_m`` with that
 probability (or certainly, where `guarantee` is ``"proven"``). How far off the receiver itself is, for
-a minute at a time, is `Track.slow_m`; with it the interval is about the truth: `Track.truth_half_m`.
+minutes at a time, is `Track.slow_m`; with it the interval is about the truth: `Track.truth_half_m`.
 """
 
 from collections.abc import Mapping
@@ -231,7 +231,7 @@ class Track:
         """(M, 2) array: half-widths, east and north, about where the vehicle was, in metres; None if not known.
 
         Those of the receiver's position and `slow_m` at the same level, as independent errors:
-        sqrt(half^2 + (z slow)^2). They rest on a model of the receiver's error, that it lasts for about a minute, and
+        sqrt(half^2 + (z slow)^2). They rest on a model of the receiver's error, that it lasts for about two minutes, and
         nothing in a log can test that.
         """
         if self.slow_m is None:
