@@ -6,10 +6,10 @@ wanders does not agree with dead reckoning, and that is in the log: the chain wi
 maximisation moves this scale so slowly that it stays near where it began (measured: 0.8 to 1.3 m for true errors of
 0.04 to 0.5 m, where the largest likelihood finds 0.08 to 0.5 m).
 
-How long an error lasts is not in the log: a receiver that is off by the same all along agrees with itself. `MEMORY` is an
-assumption, twice the chain's 60 s to be rather too wide than too narrow; an error that lasts longer is only found in
-part. And what the sensors are wrong
-by for as long as that is taken for the fixes' error: on logs with poor sensors the number is too large, not too small.
+How long an error lasts is not in the log: a receiver that is off by the same all along agrees with itself. `MEMORY` is
+an assumption, twice the chain's 60 s to be rather too wide than too narrow; an error that lasts longer is only found in
+part. And what the sensors are wrong by for as long as that is taken for the fixes' error: on logs with poor sensors the
+number is too large, not too small.
 """
 
 from collections.abc import Sequence

@@ -231,8 +231,8 @@ class Track:
         """(M, 2) array: half-widths, east and north, about where the vehicle was, in metres; None if not known.
 
         Those of the receiver's position and `slow_m` at the same level, as independent errors:
-        sqrt(half^2 + (z slow)^2). They rest on a model of the receiver's error, that it lasts for about two minutes, and
-        nothing in a log can test that.
+        sqrt(half^2 + (z slow)^2). They rest on a model of the receiver's error, that it lasts for about two minutes,
+        and nothing in a log can test that.
         """
         if self.slow_m is None:
             return None
