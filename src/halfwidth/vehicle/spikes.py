@@ -4,7 +4,7 @@ A broken telegram gives a speed of 120 m/s for a tenth of a second; a bus that h
 and leaps to the true one afterwards. Either bends the path by metres and spoils the calibration of the sensor, and no
 test of fixes names it. One or two samples are a spike if they are further from the median of five neighbours than a car
 can change in that time, and than ten times what is usual. Equal samples for a second or more are stuck if the value
-before or after them is out of a car's reach; a car that cruises ends that smoothly.
+before or after them is out of a car's reach; a car that cruises ends that smoothly. Leaps to and from 0 prove nothing.
 """
 
 from collections.abc import Mapping
@@ -113,18 +113,14 @@ def spikes(log: Log) -> Spikes:
         if 0 < spike.sum() <= max(1.0, _MANY * rows.size):
             found[name] = rows[spike]
             rows, t, values = rows[~spike], t[~spike], values[~spike]
-        leap = np.abs(np.diff(values)) > at_once + rate * np.diff(t)
+        # a car may stand for as long as it likes, and a coarse log may stop it at once
+        leap = (np.abs(np.diff(values)) > at_once + rate * np.diff(t)) & (values[1:] != 0) & (values[:-1] != 0)
         begin = np.flatnonzero(np.concatenate(([True], np.diff(values) != 0)))
         end = np.concatenate((begin[1:], [values.size])) - 1
         long = (end - begin + 1 >= _STUCK) & (t[end] - t[begin] >= _STUCK_S)
         first, last = begin[long], end[long]
         leaps = np.concatenate(([False], leap, [False]))
-        before, after = leaps[first], leaps[last + 1]
-        # a car that stands next to a stretch that is stuck: the leap is the other one's
-        stands = (values[first] == 0) & (
-            (before & ~after & np.isin(first - 1, last)) | (after & ~before & np.isin(last + 1, first))
-        )
-        odd = (before | after) & ~stands
+        odd = leaps[first] | leaps[last + 1]
         runs = [rows[a : b + 1] for a, b in zip(first[odd], last[odd], strict=True)]
         if runs and sum(run.size for run in runs) <= _MANY_STUCK * rows.size:
             stuck[name] = runs
