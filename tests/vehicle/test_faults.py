@@ -13,6 +13,7 @@ from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.check_sensors import items
 from halfwidth.vehicle.formats import read
 from halfwidth.vehicle.grid import sampled
+from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.stray import strays
 
 GAPS = ((100.0, 125.0), (220.0, 235.0))
@@ -160,3 +161,129 @@ def test_everything_at_one_hertz(data):
     east = (track.lon_deg[inside] - log.lon_deg[real]) * 111_320 * np.cos(np.radians(41.26))
     assert np.hypot(east, north).max() < 10
     assert said(track, "clocks against the fixes: speed -0.")
+
+
+def frozen(log, first, last):
+    """The log with a receiver that repeats itself."""
+    rows = np.flatnonzero(log.fixed & (log.t >= first) & (log.t <= last))
+    lat, lon = log.lat_deg.copy(), log.lon_deg.copy()
+    lat[rows], lon[rows] = lat[rows[0]], lon[rows[0]]
+    return replace(log, lat_deg=lat, lon_deg=lon)
+
+
+def at_one_hertz(log):
+    """The log with one row in ten."""
+    names = ("t", "lat_deg", "lon_deg", "alt_m", "azimuth_rad", "speed_mps", "yaw_rate_radps")
+    return Log(**{name: getattr(log, name)[::10] for name in names}, source=log.source)
+
+
+def first_fixes_wrong(log):
+    return shifted(log, np.concatenate([after(log, last, 1.0) for _, last in GAPS]), 60.0)
+
+
+FAULTS = {
+    "sign": (lambda log: replace(log, yaw_rate_radps=-log.yaw_rate_radps), "positive to the right"),
+    "degrees": (lambda log: replace(log, yaw_rate_radps=np.degrees(log.yaw_rate_radps)), "in deg/s"),
+    "km/h": (lambda log: replace(log, speed_mps=3.6 * log.speed_mps), "speed is in km/h"),
+    "freeze": (lambda log: frozen(log, 160, 168), "repeat the fix before"),
+    "first fixes": (first_fixes_wrong, "where the vehicle cannot have been"),
+    "clock step": (lambda log: replace(log, t=np.where(log.t > 270, log.t + 2.0, log.t)), "2.1 s in all"),
+}
+
+
+@pytest.mark.parametrize(
+    "both",
+    [
+        ("sign", "km/h"),
+        ("degrees", "km/h"),
+        ("sign", "first fixes"),
+        ("km/h", "freeze"),
+        ("sign", "km/h", "first fixes", "clock step"),
+    ],
+    ids=" and ".join,
+)
+def test_faults_together_are_each_named_and_put_right(drive, clean, both):
+    truth, log = drive
+    for name in both:
+        log = FAULTS[name][0](log)
+    track = fill(log)
+    for name in both:
+        assert said(track, FAULTS[name][1]), name
+    assert in_gaps(truth, track) < 2 * clean + 0.5
+
+
+@pytest.mark.parametrize("fault", ["sign", "km/h", "degrees", "first fixes"])
+def test_faults_at_one_hertz(drive, clean, fault):
+    truth, log = drive
+    track = fill(at_one_hertz(FAULTS[fault][0](log)))
+    assert in_gaps(truth, track) < 2 * clean + 1.0
+    assert fault == "first fixes" or said(track, FAULTS[fault][1])
+
+
+def test_without_a_speed_a_jump_is_still_found(drive):
+    truth, log = drive
+    bare = replace(log, speed_mps=np.full(len(log), np.nan))
+    track = fill(shifted(bare, after(log, 170, 1.0), 60.0))
+    assert said(track, "lie off the path of the others")
+    assert in_gaps(truth, track, ((171.5, 175.0),)) < 3
+
+
+def test_spikes_of_the_sensors_are_left_out(drive, clean):
+    truth, log = drive
+    speed, yaw = log.speed_mps.copy(), log.yaw_rate_radps.copy()
+    speed[[1050, 1120, 1700]], yaw[[1080, 2250]] = 110.0, (-9.0, 12.0)
+    wrong = replace(log, speed_mps=speed, yaw_rate_radps=yaw)
+    track = fill(wrong)
+    assert said(track, "3 samples of the speed that no car can have had")
+    assert said(track, "2 samples of the yaw rate that no car can have had")
+    assert in_gaps(truth, track) < 1.2 * clean + 0.2
+    assert in_gaps(truth, fill(wrong, distrust=False)) > 3 * clean
+
+
+def test_a_speed_that_is_stuck_in_a_gap_is_taken_for_none(drive):
+    truth, log = drive
+    at = int(np.argmax(np.abs(truth.speed_mps[1020:1150] - truth.speed_mps[1200])))
+    rows = np.arange(1020 + at, 1200)
+    stuck = log.speed_mps.copy()
+    stuck[rows] = stuck[rows[0]] + 9.0
+    track = fill(replace(log, speed_mps=stuck))
+    assert said(track, "the speed is stuck and then leaps")
+    inside = (track.t_s >= GAPS[0][0]) & (track.t_s <= GAPS[0][1])
+    off = np.abs(np.column_stack(truth.error_m(track.t_s[inside], track.lat_deg[inside], track.lon_deg[inside])))
+    assert np.mean(off <= track.truth_half_m[inside]) > 0.7
+
+
+@pytest.mark.parametrize("seed", [22, 23])
+def test_multipath_that_fades_on_consumer_fixes_bends_a_gap_less_than_half(seed):
+    truth, log = simulate_drive(
+        duration=330.0, outages=GAPS, fix_noise=0.5, fix_offset=1.0, seed=seed, multipath=15.0, multipath_time=3.0
+    )
+    assert in_gaps(truth, fill(log)) < 0.5 * 15.0  # 12 to 13 m where it is believed
+
+
+def test_on_the_command_line_each_fault_is_named_with_the_line_to_type(drive, tmp_path, capsys):
+    from halfwidth.shells import cli
+
+    _, log = drive
+    for name in ("sign", "km/h", "freeze", "first fixes"):
+        log = FAULTS[name][0](log)
+    frame = log.frame()
+    speed = frame["speed_mps"].to_numpy().copy()
+    speed[600] = 500.0
+    frame["speed_mps"] = speed
+    path = tmp_path / "drive.csv"
+    frame.to_csv(path, index=False)
+    assert cli.run(["check", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "speed is in km/h" in out
+    assert "--columns 'speed=speed_mps[km/h]'" in out
+    assert "its sign is that of a turn to the right" in out
+    assert "--columns 'yaw_rate=-yaw_rate_radps[rad/s]'" in out
+    assert "repeat the fix before while the car moved" in out
+    assert "1 sample of the speed that no car can have had" in out
+    assert f"halfwidth fill {path} -o track.gpx" in out
+    lines = "speed=speed_mps[km/h],yaw_rate=-yaw_rate_radps[rad/s]"
+    assert cli.run(["fill", str(path), "-o", str(tmp_path / "track.csv"), "--columns", lines]) == 0
+    said_there = "".join(capsys.readouterr())
+    assert "where the vehicle cannot have been" in said_there
+    assert "receiver would have seen the vehicle" in said_there

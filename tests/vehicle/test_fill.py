@@ -4,11 +4,11 @@ import time
 
 import numpy as np
 import pytest
-from tests.vehicle.known import known, real_log
+from tests.vehicle.known import FRAME, known, real_log
 
 import halfwidth as hw
 from halfwidth.errors import BadLog, BadValue
-from halfwidth.vehicle import calibrate, estimators
+from halfwidth.vehicle import estimators
 from halfwidth.vehicle.fill import fill
 from halfwidth.vehicle.frames import Frame
 from halfwidth.vehicle.log import Log
@@ -52,16 +52,37 @@ def test_a_gap_is_filled_near_the_truth_and_says_how_near():
     np.testing.assert_allclose(track.alt_m, 200.0)
 
 
-def test_a_slow_error_of_the_receiver_is_named_and_not_in_the_half_widths():
-    inside = []
-    for seed in range(3):
-        made = drive(duration=240.0, offset=1.0, seed=seed)
+def test_a_slow_error_of_the_receiver_is_named_and_in_the_half_widths_about_the_truth():
+    inside, true, about = [], [], []
+    for seed in range(4):
+        size = (0.1, 0.3, 1.0, 3.0)[seed]
+        made = drive(duration=240.0, offset=size, seed=seed)
         spans = [(60.0, 75.0), (150.0, 180.0)]
         track = fill(made.log.without(*spans[0]).without(*spans[1]))
         inside.append(_against_hidden(made.log, track, spans)[2])
-        assert 0.5 < track.settings["slow error of the fixes"] < 6.0
-        assert any("for minutes at a time" in message for message in track.messages)
+        found = track.settings["slow error of the fixes"]
+        assert found < 2.5 * size
+        assert size < 1.0 or found > 0.4 * size
+        assert any("not where it was" in message for message in track.messages)
+        assert size < 1.0 or any("for minutes at a time" in message for message in track.messages)
+        at = np.searchsorted(made.t, track.t_s)
+        off = np.abs(
+            np.column_stack(FRAME.to_local(track.lat_deg, track.lon_deg))
+            - np.column_stack((made.east[at], made.north[at]))
+        )
+        true.append(np.mean(off <= track.truth_half_m))
+        about.append(np.mean(off <= np.column_stack((track.east_half_m, track.north_half_m))))
+        assert (track.truth_half_m >= np.column_stack((track.east_half_m, track.north_half_m))).all()
     assert 0.75 < np.mean(inside) <= 1.0
+    assert np.mean(true) > 0.75  # the log tells the size of the error, not how long it lasts
+    assert np.mean(about[2:]) < 0.5  # what the half-widths do not promise
+
+
+def test_fixes_without_a_slow_error_have_none():
+    made = drive(duration=240.0, noise=0.3)
+    track = fill(made.log.without(100, 120))
+    assert track.settings["slow error of the fixes"] < 0.15
+    assert track.truth_half_m.max() < 1.5 * track.half_m.max()
 
 
 def test_rows_between_usual_fixes_are_not_asked_for():
@@ -239,15 +260,6 @@ def test_the_intervals_are_tested_on_the_log_itself():
     assert rows[0]["stretches"] >= 3
     assert rows[0]["inflation"] > 0
     assert any(name.startswith("inflation at") for name in track.settings)
-
-
-def test_inflation_is_interpolated_and_never_below_one():
-    one = calibrate.Tested(2.0, 9, 0.1, 0.2, 0.95, 0.7)
-    two = calibrate.Tested(20.0, 9, 1.0, 2.0, 0.6, 3.0)
-    factor = calibrate.inflation([one, two], np.array([1.0, 2.0, np.sqrt(40.0), 20.0, 90.0]))
-    np.testing.assert_allclose(factor, [1.0, 1.0, np.sqrt(3.0), 3.0, 3.0])
-    np.testing.assert_allclose(calibrate.inflation([], np.array([1.0, 5.0])), 2.0)
-    np.testing.assert_allclose(calibrate.inflation([one], np.array([1.0]), least=0.0), 0.7)
 
 
 def test_wrong_arguments():
@@ -428,7 +440,7 @@ def test_where_the_speed_is_lost_with_the_fixes_half_widths_are_of_the_size_of_t
     track = sound(fill(_hole(log, spans, *silent)))
     error, half, inside = _against_hidden(log, track, spans)
     assert inside > 0.85
-    assert half.max() < 4 * error.max()
+    assert half.max() < 6 * error.max()  # a few guesses in what the other gaps have left are all there is to size it by
     assert any("without speed" in message and "tested on" in message for message in track.messages)
 
 

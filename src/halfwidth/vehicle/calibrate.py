@@ -3,10 +3,23 @@
 A model's variance in a gap is too small where its errors are not as independent as it takes them (measured on real
 logs: a 90 % interval held 45 to 98 % of hidden fixes). So stretches of the log that do have fixes are hidden, many at
 once and far enough apart, filled with what was learnt, and compared. For each hidden fix there is a factor on the
-standard deviation that would just have covered it; the wanted quantile of these factors is the inflation. With n
-independent errors the quantile is taken at ``level (n + 1) / n``, the correction of split conformal prediction, so
-that few stretches give a wide interval and not a lucky one; each stretch counts as four (two axes, two halves), and
-as one where a sensor is missing. This is an observed frequency on this log, no guarantee.
+standard deviation that would just have covered it; the wanted quantile of these factors, each stretch counting the
+same, is what they ask for.
+
+A log has room for few stretches of a minute and for many of five seconds, and a model may be right about the edges of a
+gap, where the error of a fix counts, and wrong about its middle, where the sensors do. So the hidden fixes of each
+length are divided into `GROUPS` by the standard deviation s that the model states, and all groups of all lengths are
+read together: the logarithm of the factor is taken to be
+
+    log factor(s, L) = a + f(log s) + g(log L)
+
+with a Gaussian, f and g Ornstein-Uhlenbeck processes (`_SIZE`, `_BY_SD`, `_BY_LENGTH`), seen in each group with the
+variance of a sample quantile of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n. For n a stretch counts as four (two
+axes, two halves), or as one where a sensor is missing; groups near each other share their noise, as they come from the
+same places. That gives the factor for any s and L, and the variance v of its logarithm. A scale known from n
+independent errors has v = 1 / (2 n), and the interval is then Student's: the factor is multiplied by
+t(level, 1 / (2 v)) / z, so that few stretches give a wide interval and not a lucky one. This is an observed frequency
+on this log, no guarantee.
 
 A gap in which the speed or the yaw rate is silent as well is another thing than one in which they speak: for such gaps
 they are hidden together with the fixes. What lies beyond the first or the last fix is tested by windows of the log
@@ -15,6 +28,7 @@ whose own beginning or end is hidden. Where nothing can be hidden, the standard 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +38,14 @@ from halfwidth.vehicle.path import Path
 
 Floats = NDArray[np.float64]
 
-#: Lengths at most at which the log is tested, and shifted repetitions of each test.
-MOST_LENGTHS, PHASES = 3, 3
+#: Lengths at most at which the log is tested, each this many times the next; shifted repetitions of each test at most,
+#: and stretches that are enough without another one.
+MOST_LENGTHS, RATIO, PHASES, ENOUGH = 5, 2.0, 3, 40
 
-#: Fixes left between hidden stretches and at the ends, s, at least; and stretches needed for a quantile.
+#: Fixes that a log needs for a test.
+FEWEST_FIXES = 16
+
+#: Fixes left between hidden stretches and at the ends, s, at least; and stretches of one length that are a test.
 BETWEEN, EDGE, FEWEST = 15.0, 3.0, 3
 
 #: Windows cut out of a log to test how far off a path gets beyond the last fix, about, and their fixes, s.
@@ -40,6 +58,20 @@ MOST_NODES = 20_000
 #: vehicle did is guessed, so that one wrong guess makes all of the stretch wrong.
 _PER_STRETCH, _PER_GUESS = 4, 1
 
+#: Groups of hidden fixes of one length; one where what the vehicle did is guessed.
+GROUPS = 4
+
+#: Standard deviations of the logarithm of the factor before anything is tested: of its size, of its change with the
+#: stated standard deviation and of that with the length, where sensors carry the path and where what the vehicle did is
+#: guessed; the change in either's logarithm over which these are felt.
+_SIZE, _BY_SD, _BY_LENGTH, _BY_GUESS, _FELT = 1.0, 0.4, 0.2, 0.6, 1.5
+
+#: Most that the noise of two groups has in common.
+_SHARED = 0.95
+
+#: Least degrees of freedom of Student's distribution.
+_FEWEST_DEGREES = 2.5
+
 #: Factor on the standard deviation where a log has too few fixes to test it: on real logs thinned to 8 to 12 fixes a
 #: model's own 90 % interval held 60 to 80 % of the rest.
 UNTESTED = 2.0
@@ -49,6 +81,10 @@ LEAST = 0.1
 
 #: Shorter gaps than this are not tested by themselves, s.
 _SHORTEST = 1.0
+
+
+#: Number of a drive, the drive, the drive with stretches hidden, and the nodes of each stretch.
+_Case = tuple[int, Grid, Grid, list[slice]]
 
 
 @dataclass(frozen=True)
@@ -66,7 +102,8 @@ class Tested:
     coverage : float
         Share of hidden fixes inside the interval before it was widened, each axis by itself.
     inflation : float
-        Factor on the standard deviation that makes the interval hold.
+        Factor on the standard deviation that makes the interval hold, all lengths read together; the mean over the
+        hidden fixes.
     silent : tuple of str
         Sensors that were hidden together with the fixes.
     by : str
@@ -75,6 +112,11 @@ class Tested:
         Mean half-width at the hidden fixes with the inflation, m.
     side : str
         ``"both"`` where fixes stand on both sides of the stretches, ``"one"`` beyond the first or last fix.
+    asked : tuple of (float, float, float)
+        For each group of hidden fixes its standard deviation, m, the factor that it asks for by itself, and how many
+        independent errors that rests on.
+    guessed : bool
+        Whether what the vehicle did was guessed for lack of a sensor: longer gaps are then another thing.
     """
 
     length_s: float
@@ -87,6 +129,8 @@ class Tested:
     by: str = ""
     half_m: float = 0.0
     side: str = "both"
+    asked: tuple[tuple[float, float, float], ...] = ()
+    guessed: bool = False
 
 
 def lengths_to_test(drives: Sequence[Grid], gaps: Floats) -> list[float]:
@@ -106,19 +150,30 @@ def lengths_to_test(drives: Sequence[Grid], gaps: Floats) -> list[float]:
     spans = [np.ptp(drive.t[drive.seen]) for drive in drives if drive.seen.any()]
     if not spans or gaps.size == 0:
         return []
+    if sum(int(drive.seen.sum()) for drive in drives) < FEWEST_FIXES:
+        return []
     steps = [float(np.median(np.diff(drive.t[drive.seen]))) for drive in drives if drive.seen.sum() > 1]
     if not steps:
         return []
-    low, high = max(1.5 * min(steps), _SHORTEST), max(spans) / 5
+    low, high = max(1.5 * min(steps), _SHORTEST), max(spans) / 3
     if high <= low:
         return []
     shortest, longest = np.clip([gaps.min(), gaps.max()], low, high)
-    ends = [shortest, np.sqrt(shortest * longest), longest]
-    chosen = [float(ends[0])]
-    for end in ends[1:]:
-        if end > 1.6 * chosen[-1]:
-            chosen.append(float(end))
-    return chosen[:MOST_LENGTHS]
+    ratio = max(RATIO, (longest / shortest) ** (1 / (MOST_LENGTHS - 1)))
+    chosen, stretches = [], 0.0
+    for k in range(MOST_LENGTHS):
+        length = float(longest / ratio**k)
+        # shorter ones than any gap only help where there is no room for many of its length
+        if length < low * (1 - 1e-9) or (length < shortest * (1 - 1e-9) and stretches >= ENOUGH):
+            break
+        chosen.append(length)
+        stretches += sum(spans) / _period(length)
+    return chosen[::-1]
+
+
+def _period(length: float) -> float:
+    """Return how far apart hidden stretches of one length begin, s."""
+    return length + max(length, BETWEEN)
 
 
 def tested(
@@ -155,23 +210,29 @@ def tested(
     dict of str to list of Tested
         For each way one for each length that had enough stretches.
     """
-    found: dict[str, list[Tested]] = {}
+    by_way: dict[str, list[Tested]] = {}
     # a long log is tested on parts of it, evenly spread
     every = max(1, round(sum(len(drive) for drive in drives) / MOST_NODES))
+    parts = list(enumerate(drives))[::every]
+    room = sum(float(np.ptp(drive.t[drive.seen])) for _, drive in parts if drive.seen.any())
     for length in lengths:
-        cases = [
-            (i, drive, *hidden)
-            for i, drive in list(enumerate(drives))[::every]
-            for phase in range(PHASES)
-            if (hidden := _hidden(drive, length, phase / PHASES, silent)) is not None
-        ]
+        cases: list[_Case] = []
+        for phase in range(PHASES):
+            if sum(len(case[3]) for case in cases) >= ENOUGH:
+                break
+            every_part = [(i, drive, _hidden(drive, length, phase / PHASES, silent)) for i, drive in parts]
+            cases += [(i, drive, *hidden) for i, drive, hidden in every_part if hidden is not None]
         if not cases:
             continue
         for by, paths in rerun([case[0] for case in cases], [case[2] for case in cases]).items():
-            one = _judged(cases, paths, length, level, z, _PER_GUESS if guessed else _PER_STRETCH)
+            one = _judged(cases, paths, length, level, z, _PER_GUESS if guessed else _PER_STRETCH, room)
             if one is not None:
-                found.setdefault(by, []).append(replace(one, silent=silent, by=by))
-    return found
+                by_way.setdefault(by, []).append(replace(one, silent=silent, by=by, guessed=guessed))
+    return {by: _sized(found, level) for by, found in by_way.items() if _enough(found)}
+
+
+def _enough(found: Sequence[Tested]) -> bool:
+    return max((one.stretches for one in found), default=0) >= FEWEST
 
 
 def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -> tuple[Grid, list[slice]] | None:
@@ -180,7 +241,7 @@ def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -
     fixes = t[seen]
     if fixes.size < 5:
         return None
-    period = length + max(length, BETWEEN)
+    period = _period(length)
     begin = np.arange(fixes[0] + EDGE + phase * period, fixes[-1] - EDGE - length, period)
     usual = float(np.median(np.diff(fixes)))
     moved = np.concatenate(([0.0], np.cumsum(np.abs(drive.speed[1:]) * np.diff(t))))
@@ -236,7 +297,7 @@ def tested_ends(
             for begin in _evenly(drive, length, max(2, END_WINDOWS // len(drives)))
             for last in (True, False)
         ]
-        cases = []
+        cases: list[_Case] = []
         for i, begin, last in places[:: max(1, len(places) // END_WINDOWS)]:
             window = drives[i].between(begin, begin + END_CONTEXT + length)
             cut = begin + END_CONTEXT if last else begin + length
@@ -248,9 +309,9 @@ def tested_ends(
                 cases.append((i, window, hidden, [slice(int(at[0]), int(at[-1]) + 1)]))
         if len(cases) >= FEWEST:
             paths = rerun([case[0] for case in cases], [case[2] for case in cases])
-            one = _judged(cases, paths, length, level, z, _PER_GUESS)
-            found += [] if one is None else [replace(one, silent=silent, by=by, side="one")]
-    return found
+            one = _judged(cases, paths, length, level, z, _PER_GUESS, np.inf)
+            found += [] if one is None else [replace(one, silent=silent, by=by, side="one", guessed=True)]
+    return _sized(found, level) if _enough(found) else []
 
 
 def _evenly(drive: Grid, length: float, n: int) -> list[float]:
@@ -262,14 +323,16 @@ def _evenly(drive: Grid, length: float, n: int) -> list[float]:
 
 
 def _judged(
-    cases: Sequence[tuple[int, Grid, Grid, list[slice]]],
+    cases: Sequence[_Case],
     paths: Sequence[Path],
     length: float,
     level: float,
     z: float,
     independent: int,
+    room: float,
 ) -> Tested | None:
-    factors, means, largest, inside, halves = [], [], [], [], []
+    """Compare the paths with the hidden fixes; `room` is how many seconds of fixes the stretches lie in."""
+    factors, sds, means, largest, inside, halves = [], [], [], [], [], []
     for (_, drive, _, stretches), path in zip(cases, paths, strict=True):
         if not path.finite or path.variance is None:
             continue
@@ -279,71 +342,173 @@ def _judged(
             sd = np.sqrt(np.maximum(path.variance[part][seen] + path.fix_variance, 1e-12))
             needed = np.abs(error / (z * sd)).ravel()
             factors.append(needed)
+            sds.append(sd.ravel())
             distance = np.hypot(error[:, 0], error[:, 1])
             means.append(distance.mean())
             largest.append(distance.max())
             inside.append(np.mean(needed <= 1.0))
             halves.append(z * sd.mean())
     n = len(factors)
-    if n < FEWEST:
+    if n == 0:
         return None
-    inflation = quantile(factors, level, independent)
+    errors = _independent(n, length, room, independent)
     return Tested(
         length,
         n,
         float(np.mean(means)),
         float(np.mean(largest)),
         float(np.mean(inside)),
-        inflation,
-        half_m=inflation * float(np.mean(halves)),
+        1.0,
+        half_m=float(np.mean(halves)),
+        asked=_asked(factors, sds, level, errors, GROUPS if independent == _PER_STRETCH else 1),
     )
 
 
-def quantile(needed: Sequence[Floats], level: float, independent: int = _PER_STRETCH) -> float:
-    """Return the factor that covers a share of the hidden fixes, each stretch counting the same.
+def _asked(
+    needed: Sequence[Floats], sds: Sequence[Floats], level: float, errors: float, groups: int
+) -> tuple[tuple[float, float, float], ...]:
+    """Divide hidden fixes by their standard deviations, and say what each group asks for; see `Tested.asked`."""
+    sd, factor = np.concatenate(sds), np.concatenate(needed)
+    weight = np.concatenate([np.full(one.size, 1.0 / (len(needed) * one.size)) for one in needed])
+    order = np.argsort(sd, kind="stable")
+    group = np.minimum(np.cumsum(weight[order]) * groups * (1 - 1e-9), groups - 1).astype(int)
+    found = []
+    for k in np.unique(group):
+        mine = order[group == k]
+        asks = quantile(factor[mine], weight[mine], level, errors)
+        found.append((float(np.exp(np.log(sd[mine]).mean())), asks, errors))
+    return tuple(found)
+
+
+def _independent(n: int, length: float, room: float, each: int) -> float:
+    """Return how many independent errors there are in n stretches in so many seconds, some of which may overlap."""
+    return each * n / max(1.0, n * length / room)
+
+
+def factor_for(needed: Sequence[Floats], length: float, level: float, room: float) -> float:
+    """Return the factor that stretches of one length ask for in the next one of this length.
 
     Parameters
     ----------
     needed : sequence of arrays
         For each stretch the factors that just reach its fixes.
+    length : float
+        Of each stretch, s.
     level : float
         Wanted share.
-    independent : int
-        Errors of one stretch that count as independent.
+    room : float
+        How many seconds of the log they lie in.
 
     Returns
     -------
     float
     """
-    n = len(needed)
-    factor = np.concatenate(needed)
-    weight = np.concatenate([np.full(one.size, 1.0 / max(one.size, 1)) for one in needed])
+    errors = _independent(len(needed), length, room, _PER_STRETCH)
+    weight = np.concatenate([np.full(one.size, 1.0 / one.size) for one in needed])
+    asks = quantile(np.concatenate(needed), weight, level, errors)
+    one = Tested(length, len(needed), 0.0, 0.0, 0.0, 1.0, asked=((1.0, asks, errors),))
+    return float(inflation([one], length, np.ones(1), level, least=0.0)[0])
+
+
+def _sized(found: Sequence[Tested], level: float) -> list[Tested]:
+    """Give each test the factor that all of them together ask for."""
+    sized = []
+    for one in found:
+        sd = np.array([sd for sd, _, _ in one.asked])
+        factor = float(inflation(found, one.length_s, sd, level, least=0.0) @ sd / sd.sum())
+        sized.append(replace(one, inflation=factor, half_m=one.half_m * factor))
+    return sized
+
+
+def quantile(factor: Floats, weight: Floats, level: float, errors: float) -> float:
+    """Return the factor that covers a share of the hidden fixes.
+
+    The largest of few errors is no high quantile: it is then enlarged to the one that is wanted as if the errors were
+    Gaussian.
+
+    Parameters
+    ----------
+    factor, weight : (n,) arrays
+        Factors that just reach the fixes, and how much each counts.
+    level : float
+        Wanted share.
+    errors : float
+        How many of them are independent.
+
+    Returns
+    -------
+    float
+    """
     order = np.argsort(factor)
-    share = np.cumsum(weight[order]) / n
-    at = min(int(np.searchsorted(share, min(level * (1 + 1 / (independent * n)), 1.0 - 1e-9))), factor.size - 1)
-    return float(factor[order][at])
+    share = np.cumsum(weight[order])
+    # the i-th of N errors has median rank (i - 0.3) / (N + 0.4)
+    at, beyond = (level * (errors + 0.4) + 0.3) / errors, 1.0
+    if at > 1.0:
+        beyond = max(1.0, _z(level) / _z(max((errors - 0.3) / (errors + 0.4), 0.5)))
+    return beyond * float(np.interp(at, share / share[-1], factor[order]))
 
 
-def inflation(found: Sequence[Tested], length: Floats, *, least: float = 1.0) -> Floats:
-    """Return the factor on the standard deviation for gaps of these lengths.
+def inflation(found: Sequence[Tested], length: float, sd: Floats, level: float, *, least: float = 1.0) -> Floats:
+    """Return the factors on standard deviations in a gap.
 
-    Between tested lengths it is interpolated in the logarithm of the length; beyond them the nearest counts. Below
-    `least` it is not taken. Without a test it is `UNTESTED`.
+    Below `least` none is taken. Without a test each is `UNTESTED`.
 
     Parameters
     ----------
     found : sequence of Tested
-        Ascending lengths.
-    length : (n,) array
-        s.
+    length : float
+        Length of the gap, s.
+    sd : (n,) array
+        Standard deviations, m.
+    level : float
+        Wanted share.
     least : float
 
     Returns
     -------
     (n,) array
     """
-    if not found:
-        return np.full(np.shape(length), UNTESTED)
-    at = np.log([one.length_s for one in found])
-    factor = np.maximum([one.inflation for one in found], max(least, LEAST))
-    return np.exp(np.interp(np.log(np.maximum(length, 1e-3)), at, np.log(factor)))
+    groups = [(one.length_s, *asked) for one in found for asked in one.asked]
+    if not groups:
+        return np.full(np.shape(sd), UNTESTED)
+    lengths, sds, asked, errors = np.array(groups).T
+    at = np.log(np.column_stack((np.maximum(sds, 1e-9), lengths)))
+    to = np.log(np.column_stack((np.maximum(sd, 1e-9), np.full(np.shape(sd), max(length, 1e-3)))))
+    z = _z(level)
+    by_length = _BY_GUESS if any(one.guessed for one in found) else _BY_LENGTH
+    noise = np.sqrt(level * (1 - level) / errors) / (2 * z * NormalDist().pdf(z))
+
+    def apart(x: Floats, y: Floats) -> Floats:
+        return np.abs(x[:, None] - y)  # of sd and of length, (n, m, 2)
+
+    def alike(x: Floats, y: Floats) -> Floats:
+        return np.asarray(_SIZE**2 + np.exp(-apart(x, y) / _FELT) @ np.array([_BY_SD**2, by_length**2]))
+
+    shared = _SHARED * np.exp(-apart(at, at).sum(axis=-1)) + (1 - _SHARED) * np.eye(noise.size)
+    seen = alike(at, at) + np.outer(noise, noise) * shared
+    cross = alike(at, to)
+    known = np.linalg.solve(seen, cross)
+    variance = _SIZE**2 + _BY_SD**2 + by_length**2 - np.einsum("ij,ij->j", known, cross)
+    degrees = np.maximum(0.5 / np.maximum(variance, 1e-9), _FEWEST_DEGREES)
+    factor = np.exp(np.log(np.maximum(asked, LEAST)) @ known) * _student(level, degrees) / z
+    half = np.maximum(factor, max(least, LEAST)) * sd
+    # what is stated to be less sure is not shown as surer
+    order = np.argsort(sd, kind="stable")
+    half[order] = np.maximum.accumulate(half[order])
+    return np.asarray(half / np.maximum(sd, 1e-300))
+
+
+def _z(level: float) -> float:
+    return NormalDist().inv_cdf(0.5 + level / 2)
+
+
+def _student(level: float, degrees: Floats) -> Floats:
+    """Return half-widths of Student's intervals by the series in 1 / degrees (Abramowitz and Stegun 26.7.5)."""
+    z = _z(level)
+    terms = (
+        z,
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+    )
+    return np.asarray(np.polynomial.polynomial.polyval(1 / degrees, terms))

@@ -23,6 +23,7 @@ from halfwidth.vehicle.repair import (
     matched_factor,
     swapped_columns,
 )
+from halfwidth.vehicle.spikes import spikes
 
 Floats = NDArray[np.float64]
 
@@ -156,6 +157,7 @@ def check(log: Any) -> Check:
         log = read(log, repair=False)
     elif not isinstance(log, Log):
         log = from_frame(log, repair=False)
+    leaping, log = _spikes(log)
     swapped = _swapped(log)
     if swapped.verdict == "bad":
         first = "put latitude and longitude right first"
@@ -173,6 +175,7 @@ def check(log: Any) -> Check:
         _rates(log),
         _gaps(log),
         _pauses(log),
+        leaping,
         swapped,
         *moving,
         *_steps(log, steps_of(log)),
@@ -252,6 +255,16 @@ def _pauses(log: Log) -> Item:
     dead = any(a < start + length and start < b for a, b in log.gaps())
     also = ", and no fix came either: nothing is known there" if dead else ""
     return Item("pauses", "warn", f"no {name} for {length:.1f} s from {start:.1f} s on{also}", length, "s")
+
+
+def _spikes(log: Log) -> tuple[Item, Log]:
+    """Look for speeds and yaw rates that leap away and come back; return the log without them."""
+    found = spikes(log)
+    if not len(found):
+        return Item("spikes", "ok", "no speed or yaw rate leaps away and comes back, or is stuck", 0.0), log
+    said = "; ".join(words.removesuffix(": not used") for words in found.words(log))
+    item = Item("spikes", "warn", said, float(len(found)), line=check_sensors.fill_line(log))
+    return item, found.masked(log)
 
 
 def _swapped(log: Log) -> Item:

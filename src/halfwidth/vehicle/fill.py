@@ -9,8 +9,8 @@ piece is replaced by a simpler one there, and the track says so.
 
 Positions are those that the receiver would have reported, and the half-widths say how far off they are: hidden fixes
 lie within them as often as `level` says, on this log. What the receiver is wrong by for minutes at a time is in the
-fixes on both sides of a gap and in the filling between them, and hiding fixes cannot show it; the chain learns how
-large that slow error is (its fix offset), and the messages name it.
+fixes on both sides of a gap and in the filling between them, and hiding fixes cannot show it. How large that slow error
+is shows in how fixes and dead reckoning disagree (`slow`): the messages name it, and `Track.truth_half_m` has it.
 
     half = z inflation sqrt(variance of the path + variance of a fix)
 """
@@ -35,6 +35,8 @@ from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path, sized
 from halfwidth.vehicle.roads import roads_of
+from halfwidth.vehicle.slow import Slow, slow_error
+from halfwidth.vehicle.spikes import spikes
 from halfwidth.vehicle.stray import strays
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
 
@@ -94,8 +96,9 @@ def fill(
         Seconds to add to the time stamps of speed and yaw rate so that they agree with those of the fixes; found from
         the log, for each by itself, if absent.
     distrust : bool
-        Whether fixes that only repeat the one before while the car moves are found and bridged; the track's messages
-        name them.
+        Whether samples are looked for that are not what they claim, and left out: fixes that only repeat the one
+        before while the car moves or lie where it cannot have been, speeds and yaw rates that leap away and come back.
+        The track's messages name them.
     second : Log, path or frame, optional
         Fixes of a second antenna, on the clock of the first one's. This, `roads` and `limits` are for the two-antenna
         model, which is the method where one of them is given and `method` is absent.
@@ -136,7 +139,12 @@ def fill(
         raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
     messages: list[str] = []
     if distrust:
-        doubtful = distrusted(drive_log, jumps=False)  # stray ones show against speed and yaw rate, later
+        leaps = spikes(drive_log)
+        messages.extend(leaps.words(drive_log))
+        drive_log = leaps.masked(drive_log)
+        # stray fixes show best against speed and yaw rate, later
+        sensed = all(np.isfinite(getattr(drive_log, name)).any() for name in ("speed_mps", "yaw_rate_radps"))
+        doubtful = distrusted(drive_log, jumps=not sensed)
         messages.extend(doubtful.words(drive_log))
         drive_log = doubtful.masked(drive_log)
     drive_log = _with_pauses_filled(drive_log, messages)
@@ -159,8 +167,7 @@ def fill(
     answers = _estimated(pieces, chosen, spans, level, messages, free=free)
     columns = _read(answers, pieces, t)
     away = _distance_in_time(drive_log, t)
-    z = NormalDist().inv_cdf(0.5 + level / 2)
-    half = _half_widths(columns, answers, grid, away, z, t, quality)
+    half = _half_widths(columns, answers, grid, away, level, t, quality)
     arm_east, arm_north = sensors.arm(t)
     east, north = columns.east + arm_east, columns.north + arm_north
     lat, lon = grid.frame.to_geodetic(east, north)
@@ -193,6 +200,7 @@ def fill(
         messages=tuple(messages),
         native=native,
         proven=band,
+        slow_m=None if answers.slow is None else answers.slow.at(t),
     )
 
 
@@ -443,6 +451,7 @@ class _Answers:
     paths: list[Path]
     bridges: list[_Bridge]
     settings: dict[str, object]
+    slow: Slow | None
 
     @property
     def tested(self) -> list[calibrate.Tested]:
@@ -462,7 +471,7 @@ def _estimated(
     """Estimate every piece, with simpler methods where the chosen one fails, and test the intervals."""
     grids = [piece.grid for piece in pieces]  # of which the chain takes away the fixes it cannot believe
     able = [i for i, grid in enumerate(grids) if chosen.name == "linear" or int(grid.seen.sum()) >= FEWEST]
-    found, rerun, settings = _ran(chosen, grids, able, messages)
+    found, rerun, settings, slow = _ran(chosen, grids, able, messages)
     messages.extend(dict.fromkeys(note for path in found.values() for note in path.info.get("notes", ())))
     failed = [i for i in range(len(grids)) if i not in found or not _plausible(found[i], grids[i])]
     if failed and chosen.name != "linear":
@@ -480,7 +489,7 @@ def _estimated(
             *(["cv"] if blind else []),
         ]
         for name in names:
-            own, again, _ = _ran(METHODS[name], grids, good, None)
+            own, again, _, _ = _ran(METHODS[name], grids, good, None)
             if all(_plausible(path, grids[i]) for i, path in own.items()):
                 rivals[name] = _Rival(own, again)
     bridges: list[_Bridge] = []
@@ -529,7 +538,7 @@ def _estimated(
         taken = [(bridge.span.start, bridge.span.stop) for bridge in bridges if bridge.by == name]
         for i, path in rival.paths.items():
             paths[i] = _bridged(paths[i], path, grids[i], taken)
-    answers = _Answers(paths, bridges, settings)
+    answers = _Answers(paths, bridges, settings, slow)
     settings.update(
         {
             f"inflation at {one.length_s:.3g} s{_beyond(one)}{_without(one.silent)}{_by(one.by, chosen.name)}": round(
@@ -611,22 +620,25 @@ def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, f
 
 def _ran(
     chosen: Method, grids: list[Grid], able: Sequence[int], messages: list[str] | None
-) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
+) -> tuple[dict[int, Path], Rerun, dict[str, object], Slow | None]:
     """Run a method on the pieces that have enough fixes."""
-    return _chain(chosen, grids, able, messages) if chosen.name in COLOURS else _plain(chosen, grids, able)
+    if chosen.name in COLOURS:
+        return _chain(chosen, grids, able, messages)
+    return *_plain(chosen, grids, able), None
 
 
 def _chain(
     chosen: Method, grids: list[Grid], able: Sequence[int], messages: list[str] | None
-) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
+) -> tuple[dict[int, Path], Rerun, dict[str, object], Slow | None]:
     """Solve the chain without the fixes that it cannot believe; where `messages` is None they are gone already."""
     colour = COLOURS[chosen.name]
     stray: list[float] = []
     todo = list(able) if messages is not None else []
     messages = [] if messages is None else messages
+    stiff: dict[int, chain.Fit] = {}
     for _ in range(_SCREENINGS):
-        screened = zip(todo, chain.solve([grids[i] for i in todo], _STIFF), strict=True)
-        hidden = {i: _stray(fit.path, grids[i]) for i, fit in screened}
+        stiff.update(zip(todo, chain.solve([grids[i] for i in todo], _STIFF), strict=True))
+        hidden = {i: _stray(stiff[i].path, grids[i]) for i in todo}
         todo = [i for i in todo if hidden[i].any()]
         for i in todo:
             stray += grids[i].t[hidden[i]].tolist()
@@ -658,16 +670,27 @@ def _chain(
         settings.update(
             {f"{name} noise": float(f"{value:.3g}") for name, value in zip(chain.GROUPS, sigma, strict=True)}
         )
-        for name in ("speed_scale", "yaw_bias", "slow_sd"):
+        for name in ("speed_scale", "yaw_bias"):
             value = np.average([fit.path.info[name] for fit in fits.values()], weights=weight)
             settings[_WORDS[name]] = float(f"{value:.4g}")
-        slow = float(np.average([fit.path.info["slow_sd"] for fit in fits.values()], weights=weight))
-    if fits and colour.slow:
-        messages.append(
-            f"the fixes are taken to be wrong by {slow:.2g} m for minutes at a time (1 sigma, learnt from the drive);"
-            " hiding fixes cannot show that, and the half-widths say where the receiver would have seen the vehicle"
-        )
-    return {i: fit.path for i, fit in fits.items()}, rerun, settings
+    slow = None
+    if stiff and colour.slow:
+        slow = slow_error([grids[i] for i in fits], [stiff[i] for i in fits], list(fits.values()))
+    if slow is not None:
+        settings[_WORDS["slow_sd"]] = float(f"{slow.sd:.3g}")
+        messages.append(_slow_words(slow))
+    return {i: fit.path for i, fit in fits.items()}, rerun, settings, slow
+
+
+def _slow_words(slow: Slow) -> str:
+    """Say what the half-widths are about, and how far off that the truth may be."""
+    promise = "the half-widths hold where the receiver would have seen the vehicle, not where it was"
+    if not slow.seen:
+        return f"{promise}; no error of the fixes that lasts for minutes shows in the drive"
+    return (
+        f"{promise}: the fixes are wrong by {slow.sd:.2g} m for minutes at a time (1 sigma, as they and the sensors"
+        " disagree), which hiding fixes cannot show; `truth_half_m` of the track has it"
+    )
 
 
 def _stray(path: Path, grid: Grid) -> NDArray[np.bool_]:
@@ -872,16 +895,19 @@ def _half_widths(
     answers: _Answers,
     grid: Grid,
     away: Floats,
-    z: float,
+    level: float,
     t: Floats,
     quality: NDArray[np.str_],
 ) -> Floats:
     """Return the half-widths (M, 2), m: the model's, widened as tested, and no wider than a vehicle can go."""
-    factor = np.ones(away.size)
+    z = NormalDist().inv_cdf(0.5 + level / 2)
+    sd = np.sqrt(columns.variance + columns.fix_variance[:, None])
+    half = z * sd
     for bridge in answers.bridges:
         rows = (quality != "fix") & (t >= bridge.span.start) & (t <= bridge.span.stop)
-        factor[rows] = calibrate.inflation(bridge.tested, np.array([bridge.span.length]), least=bridge.least)
-    half = z * factor[:, None] * np.sqrt(columns.variance + columns.fix_variance[:, None])
+        for axis in (0, 1):
+            own = sd[rows, axis]
+            half[rows, axis] *= calibrate.inflation(bridge.tested, bridge.span.length, own, level, least=bridge.least)
     # twice: both the estimate and the vehicle are within reach of the nearest fix
     limit = 2 * _top_speed(grid) * away + z * np.sqrt(columns.fix_variance) + 10.0
     return np.minimum(half, limit[:, None])

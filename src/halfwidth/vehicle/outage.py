@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue, Missing
 from halfwidth.vehicle.align import calibrated
-from halfwidth.vehicle.calibrate import FEWEST, quantile
+from halfwidth.vehicle.calibrate import FEWEST, factor_for
 from halfwidth.vehicle.estimators import METHODS, Method, method, usable
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log, to_frame
@@ -129,7 +129,8 @@ class Cell:
         for k in range(self.n):
             others = np.flatnonzero(np.abs(self.start - self.start[k]) > self.length)
             if others.size >= FEWEST:
-                found[k] = quantile([self.needed[i] for i in others], self.level)
+                room = float(np.ptp(self.start[others])) + self.length
+                found[k] = factor_for([self.needed[i] for i in others], self.length, self.level, room)
         return found
 
     @property

@@ -272,8 +272,12 @@ class _Search:
             room = length + AROUND / 2
             t = self.grid.t[self.seen]
             controls = []
-            for a, b in _blocks(self.grid, self.seen):
-                times = np.arange(t[a] + room, t[b - 1] - room, max(length, (t[-1] - t[0]) / _CONTROLS))
+            blocks = [(a, b) for a, b in _blocks(self.grid, self.seen) if t[b - 1] - t[a] > 2 * room]
+            space = sum(float(t[b - 1] - t[a]) - 2 * room for a, b in blocks)
+            # on a short drive they overlap, sooner than being too few
+            apart = min(max(length, (t[-1] - t[0]) / _CONTROLS), max(space / (2 * _FEWEST_CONTROLS), 1.0))
+            for a, b in blocks:
+                times = np.arange(t[a] + room, t[b - 1] - room, apart)
                 firsts = np.searchsorted(t, times)
                 controls += [
                     replace(doubt, first=int(k), most=np.inf, block=(a, b))

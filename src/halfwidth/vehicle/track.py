@@ -3,14 +3,16 @@
 A `Track` is the answer of `halfwidth.vehicle.fill` and the only thing that is written, drawn and
 reported. It holds arrays on one row axis, the gaps that were filled, the log it came from and what
 is needed to reproduce it; it is a value and never changes. The half-widths are those of the
-interval at `level`, separately for east and north: the position is claimed to lie within
-``lat, lon`` plus or minus ``east_half_m, north_half_m`` with that probability (or certainly, where
-`guarantee` is ``"proven"``).
+interval at `level`, separately for east and north: the position that the receiver would have
+reported is claimed to lie within ``lat, lon`` plus or minus ``east_half_m, north_half_m`` with that
+probability (or certainly, where `guarantee` is ``"proven"``). How far off the receiver itself is, for
+minutes at a time, is `Track.slow_m`; with it the interval is about the truth: `Track.truth_half_m`.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import NormalDist
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -126,6 +128,9 @@ class Track:
         What a reader of the track must know.
     native : {"pandas", "polars", "pyarrow"}
         The library whose frame `frame` returns: that of the frame that came in.
+    slow_m : (M, 2) array, optional
+        How far the receiver itself is off the truth, east and north, as a standard deviation in metres: what all fixes
+        around a row share. The half-widths say where the receiver would have seen the vehicle; they do not have it.
     proven : Proven, optional
         A band of its own from declared half-widths, in columns of its own; never part of the half-widths.
 
@@ -157,6 +162,7 @@ class Track:
     messages: tuple[str, ...] = ()
     native: str = "pandas"
     proven: "Proven | None" = None
+    slow_m: Floats | None = None
 
     def __post_init__(self) -> None:
         t = _column("t_s", self.t_s, None)
@@ -190,6 +196,16 @@ class Track:
             raise BadValue(f"`level` is {self.level}, between 0 and 1 is expected", hint="level=0.9")
         if self.guarantee not in GUARANTEES:
             raise BadValue(f"`guarantee` is {self.guarantee!r}, one of {', '.join(GUARANTEES)} is expected")
+        if self.slow_m is not None:
+            slow = np.array(self.slow_m, dtype=np.float64)
+            if slow.shape != (t.size, 2):
+                raise BadShape(f"`slow_m` has shape {slow.shape}, ({t.size}, 2) is expected")
+            if not (np.isfinite(slow).all() and (slow >= 0).all()):
+                raise BadValue(
+                    "`slow_m` holds a number that is not finite or negative, a standard deviation is neither"
+                )
+            slow.setflags(write=False)
+            object.__setattr__(self, "slow_m", slow)
         if self.proven is not None and self.proven.proven_west_m.shape != t.shape:
             raise BadShape(f"`proven` has {self.proven.proven_west_m.size} rows but `t_s` has {t.size}")
         object.__setattr__(self, "gaps", tuple(self.gaps))
@@ -209,6 +225,20 @@ class Track:
         """(M,) array: the larger of the two half-widths, in metres."""
         larger: Floats = np.maximum(self.east_half_m, self.north_half_m)
         return larger
+
+    @property
+    def truth_half_m(self) -> Floats | None:
+        """(M, 2) array: half-widths, east and north, about where the vehicle was, in metres; None if not known.
+
+        Those of the receiver's position and `slow_m` at the same level, as independent errors:
+        sqrt(half^2 + (z slow)^2). They rest on a model of the receiver's error, that it lasts for about two minutes,
+        and nothing in a log can test that.
+        """
+        if self.slow_m is None:
+            return None
+        z = NormalDist().inv_cdf(0.5 + self.level / 2)
+        half = np.column_stack((self.east_half_m, self.north_half_m))
+        return np.asarray(np.hypot(half, z * self.slow_m))
 
     @property
     def proven_columns(self) -> dict[str, Floats]:

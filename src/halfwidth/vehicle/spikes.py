@@ -1,0 +1,127 @@
+"""Samples of speed and yaw rate that no car can have had: they leap away and come back, or are stuck and then leap.
+
+A broken telegram gives a speed of 120 m/s for a tenth of a second; a bus that hangs repeats the same value for seconds
+and leaps to the true one afterwards. Either bends the path by metres and spoils the calibration of the sensor, and no
+test of fixes names it. One or two samples are a spike if they are further from the median of five neighbours than a car
+can change in that time, and than ten times what is usual. Equal samples for a second or more are stuck if the value
+before or after them is out of a car's reach; a car that cruises ends that smoothly. Leaps to and from 0 prove nothing.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.vehicle.log import Log
+
+Floats = NDArray[np.float64]
+
+#: What a sample may differ by at once and by how much more for each second, the stream's name and its unit.
+_LIMIT = {"speed_mps": (1.0, 12.0, "speed", "m/s"), "yaw_rate_radps": (0.4, 3.0, "yaw rate", "rad/s")}
+
+_NONE = np.empty(0, dtype=np.intp)
+
+#: How many times the usual distance from the median is not usual; the share of samples that is no exception any more.
+_UNUSUAL, _MANY, _MANY_STUCK = 10.0, 0.02, 0.3
+
+#: Samples looked at together.
+_WINDOW = 5
+
+#: Equal samples are stuck from so many of them and so many seconds on.
+_STUCK, _STUCK_S = 5, 1.0
+
+#: No car turns like this for a twentieth of the time, rad/s: the stream is in degrees.
+_IN_DEGREES = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Spikes:
+    """Which samples of a log are spikes, and which are stuck.
+
+    Parameters
+    ----------
+    rows : mapping of str to (n,) int array
+        Rows of spikes by field of the log.
+    stuck : mapping of str to list of (n,) int array
+        Rows of each stretch that is stuck.
+    """
+
+    rows: Mapping[str, NDArray[np.intp]]
+    stuck: Mapping[str, list[NDArray[np.intp]]]
+
+    def __len__(self) -> int:
+        return sum(self._gone(name).size for name in _LIMIT)
+
+    def _gone(self, name: str) -> NDArray[np.intp]:
+        return np.concatenate([self.rows.get(name, _NONE), *self.stuck.get(name, [])])
+
+    def masked(self, log: Log) -> Log:
+        """Return the log without these samples."""
+        changed: dict[str, Any] = {}
+        for name in {*self.rows, *self.stuck}:
+            values = getattr(log, name).copy()
+            values[self._gone(name)] = np.nan
+            changed[name] = values
+        return replace(log, **changed) if changed else log
+
+    def words(self, log: Log) -> list[str]:
+        """Say what was found, with times and sizes."""
+        found = []
+        for name, (_, _, label, unit) in _LIMIT.items():
+            values, rows, stuck = getattr(log, name), self.rows.get(name, _NONE), self.stuck.get(name, [])
+            if rows.size:
+                listed = ", ".join(f"{log.t[k]:.1f} s ({values[k]:.3g} {unit})" for k in rows[:5].tolist())
+                some = "1 sample" if rows.size == 1 else f"{rows.size} samples"
+                more = ", ..." if rows.size > 5 else ""
+                found.append(f"{some} of the {label} that no car can have had, at {listed}{more}: not used")
+            if stuck:
+                spans = [f"{log.t[one[0]]:.1f} to {log.t[one[-1]]:.1f} s" for one in stuck]
+                more = ", ..." if len(stuck) > 5 else ""
+                found.append(f"the {label} is stuck and then leaps, {', '.join(spans[:5])}{more}: not used")
+        return found
+
+
+def spikes(log: Log) -> Spikes:
+    """Find samples of speed and yaw rate that leap away and come back, or are stuck.
+
+    Parameters
+    ----------
+    log : Log
+
+    Returns
+    -------
+    Spikes
+        None of a stream in which they are no exception.
+    """
+    found: dict[str, NDArray[np.intp]] = {}
+    stuck: dict[str, list[NDArray[np.intp]]] = {}
+    for name, (at_once, rate, _, _) in _LIMIT.items():
+        rows = np.flatnonzero(np.isfinite(getattr(log, name)))
+        if rows.size < 2 * _WINDOW:
+            continue
+        t, values = log.t[rows], getattr(log, name)[rows]
+        if name == "yaw_rate_radps" and np.quantile(np.abs(values), 0.95) > _IN_DEGREES:
+            values = np.radians(values)
+        edge = _WINDOW // 2
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(values, edge, mode="edge"), _WINDOW)
+        times = np.lib.stride_tricks.sliding_window_view(np.pad(t, edge, mode="edge"), _WINDOW)
+        off = np.abs(values - np.median(around, axis=1))
+        far = off > at_once + rate * np.maximum(times[:, -1] - t, t - times[:, 0])
+        spike = far & (off > _UNUSUAL * float(np.quantile(off, 0.9)))
+        if 0 < spike.sum() <= max(1.0, _MANY * rows.size):
+            found[name] = rows[spike]
+            rows, t, values = rows[~spike], t[~spike], values[~spike]
+        # a car may stand for as long as it likes, and a coarse log may stop it at once
+        leap = (np.abs(np.diff(values)) > at_once + rate * np.diff(t)) & (values[1:] != 0) & (values[:-1] != 0)
+        begin = np.flatnonzero(np.concatenate(([True], np.diff(values) != 0)))
+        end = np.concatenate((begin[1:], [values.size])) - 1
+        long = (end - begin + 1 >= _STUCK) & (t[end] - t[begin] >= _STUCK_S)
+        first, last = begin[long], end[long]
+        leaps = np.concatenate(([False], leap, [False]))
+        odd = leaps[first] | leaps[last + 1]
+        runs = [rows[a : b + 1] for a, b in zip(first[odd], last[odd], strict=True)]
+        if runs and sum(run.size for run in runs) <= _MANY_STUCK * rows.size:
+            stuck[name] = runs
+    return Spikes(found, stuck)
