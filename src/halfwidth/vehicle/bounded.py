@@ -106,7 +106,7 @@ def _solved(drive: Grid, settings: Bounded) -> Path:
     y[~drive.seen] = np.nan
     best: Path | None = None
     for _ in range(settings.rounds):
-        model, u, turn = _model(drive, psi, settings)
+        model, u, turn = linearised(drive, psi, settings)
         est = estimate(
             model, Record(drive.t, y, u), load("BatchLP")(objective=settings.objective, point=settings.point)
         )
@@ -150,8 +150,8 @@ def _info(model: Linear, q: Floats | None, r: Floats | None, x: Floats) -> dict[
     }
 
 
-def _model(drive: Grid, psi: Floats, settings: Bounded) -> tuple[Linear, Floats, Floats]:
-    """Return the model about azimuths psi, its input, and the matrices (T, 2, 2) from its axes to east and north."""
+def linearised(drive: Grid, psi: Floats, settings: Bounded) -> tuple[Linear, Floats, Floats]:
+    """Return the chain about azimuths psi, its input, and the matrices (T, 2, 2) from its axes to east and north."""
     h, v, w = drive.h, drive.speed, drive.yaw_rate
     T = h.size
     middle = psi.copy()

@@ -17,7 +17,7 @@ Where it does not settle nevertheless, the path is that of the Gaussian chain, a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class Credible:
     most: float = 6.0
     nodes: int = 16
     rounds: int = 1
-    base: chain.Chain = chain.Chain()
+    base: chain.Chain = field(default_factory=chain.Chain)
 
 
 def solve(drives: Sequence[Grid], settings: Credible = Credible()) -> list[Path]:
@@ -146,7 +146,7 @@ class _Problem:
         """Return an estimate as a path."""
         drive = self.drive
         place = np.einsum("tij,tj->ti", self.out, est.x) + self.origin
-        variance = np.einsum("tij,tjk,tik->ti", self.out, est.P, self.out)
+        variance = np.einsum("tij,tjk,tik->ti", self.out, np.asarray(est.P), self.out)
         half = est.info["half_widths"]
         # the bounded part of a fix error: its expected square, half-widths integrated over
         bounded = float(np.mean(half["mean"][-2:] ** 2 + half["sd"][-2:] ** 2)) / 3.0
