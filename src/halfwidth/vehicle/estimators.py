@@ -15,6 +15,7 @@ ep            the posterior of that chain where noise is partly bounded: half-wi
 slp           the same with bounded noise by sequential linear programming, central point (`bounded`)
 slp-white     the same, the fix error without an offset
 slp-log       that with the logarithmic objective
+cvar          slp-white that counts the mean of the worst rows in place of the worst one, how many by masking
 tube          the centre of the set of all paths within learnt half-widths, inflated by masking (`tube`)
 paper000      GPS/INS by linear programming, half-widths unknown, as printed in Pavelková (2011)
 paper000+ls   the same, least squares inside the optimal half-widths
@@ -389,6 +390,10 @@ def _credible(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:  # noqa: ARG0
     return credible.solve(drives)
 
 
+def _worst_share(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
+    return bounded.solve(drives, bounded.Bounded(slow=False, nu=tuned["nu"] or None))
+
+
 def _tube(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
     return tube.solve(drives, tube.Tube(inflation=tuned["inflation"]))
 
@@ -427,6 +432,15 @@ METHODS: Mapping[str, Method] = MappingProxyType(
                     ("slp-white", ", no fix offset", bounded.Bounded(slow=False)),
                     ("slp-log", ", log objective", bounded.Bounded(objective="log", slow=False)),
                 )
+            ),
+            Method(
+                "cvar",
+                "chain with bounded noise, mean of the worst rows",
+                20.0,
+                (),
+                _worst_share,
+                lambda drive: {"nu": bounded.nu_of(drive, bounded.Bounded(slow=False)) or 0.0},
+                one_of=_SENSORS,
             ),
             Method(
                 "tube",

@@ -92,27 +92,17 @@ def inflation_of(drive: Grid, settings: Tube = Tube()) -> float:
     -------
     float
     """
-    fixes = drive.t[drive.seen]
-    length = min(_HIDDEN, (fixes[-1] - fixes[0]) / 5) if fixes.size else 0.0
-    ends = (fixes[0] + length, fixes[-1] - 2 * length) if fixes.size else (0.0, -1.0)
-    if length < 1.0 or ends[1] <= ends[0]:
-        return settings.inflation
     cases = []
-    drive = with_speed(drive)
-    for begin in np.linspace(ends[0], ends[1], _STRETCHES).tolist():
-        whole = drive.between(begin - _CONTEXT, begin + length + _CONTEXT)
-        hidden = whole.without(begin, begin + length)
+    for whole, hidden, _ in bounded.stretches(with_speed(drive), _HIDDEN, _STRETCHES, _CONTEXT):
         kept = _apart(hidden, settings.step)
         rough = _coarse(hidden, kept)
+        found = bounded.solve([rough], settings.base)[0]
         out = whole.seen[kept] & ~rough.seen
-        if out.any() and rough.seen.sum() > 3 and np.abs(rough.speed[out]).mean() > 1.0:
-            found = bounded.solve([rough], settings.base)[0]
-            if "half_widths" in found.info and found.finite:
-                fixes_there = np.column_stack((whole.east, whole.north))[kept]
-                cases.append((rough, found, fixes_there, out))
+        if out.any() and "half_widths" in found.info and found.finite:
+            cases.append((rough, found, np.column_stack((whole.east, whole.north))[kept], out))
     for inflation in INFLATIONS if cases else ():
         tried = replace(settings, inflation=inflation)
-        held = [_held(*_band(rough, found, tried), found, fixes_there)[out] for rough, found, fixes_there, out in cases]
+        held = [_held(*_band(rough, found, tried), found, fixes)[out] for rough, found, fixes, out in cases]
         if np.mean(np.concatenate(held)) >= SHARE:
             return inflation
     return INFLATIONS[-1] if cases else settings.inflation
