@@ -138,7 +138,7 @@ def _solved(drive: Grid, settings: Tube) -> Path:
         f"the band is a tube of half-widths learnt from the log and inflated {inflation:.3g} times:"
         " sized by hidden fixes, not guaranteed"
     )
-    info["notes"] = [words]
+    info["notes"] = [*info.get("notes", ()), words]
     variance = (spread / _DEVIATIONS) ** 2
     fix = float(half_widths["fix"]) * inflation / np.sqrt(3.0)
     return replace(fine, east=moved[0], north=moved[1], variance=variance, fix_variance=fix**2, info=info)
@@ -151,7 +151,7 @@ def _band(rough: Grid, found: Path, settings: Tube) -> tuple[tuple[Floats, Float
     y = np.column_stack((rough.east, rough.north))
     origin = y[int(np.argmax(rough.seen))].copy()
     y = y - origin
-    y[~rough.seen] = np.nan
+    y[~rough.seen | np.isin(rough.t, [t for t, _ in found.info.get("left_out", ())])] = np.nan
     assert isinstance(model.w, Uniform)
     known = model.w.at_most.tolist()
     step = np.array([half_widths.get(name, most) for name, most in zip(model.names.x, known, strict=True)])
