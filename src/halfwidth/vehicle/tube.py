@@ -9,7 +9,7 @@ declared instead of learnt is in `halfwidth.vehicle.proven`.
 
 A set knows no averages, so neighbouring fixes tell it little that is new: it is computed on nodes about a second
 apart, whose speed is that of the chord between them, and carried to the nodes of the drive along the path of the
-bounded chain.
+bounded chain in its elastic form, which also leaves out fixes that nothing explains.
 """
 
 from collections.abc import Sequence
@@ -37,6 +37,9 @@ SHARE, _DEVIATIONS = 0.9, 1.645
 
 #: Stretches that are hidden to find the inflation: how many at most, how long, and fixes left around each, s.
 _STRETCHES, _HIDDEN, _CONTEXT = 8, 15.0, 20.0
+
+#: Share of the worst rows whose mean counts where fixes are screened.
+_ELASTIC = 0.1
 
 #: Times that a tube without any path is inflated further, and by how much.
 _FURTHER, _MORE = 3, 1.5
@@ -93,7 +96,10 @@ def inflation_of(drive: Grid, settings: Tube = Tube()) -> float:
     float
     """
     cases = []
-    for whole, hidden, _ in bounded.stretches(with_speed(drive), _HIDDEN, _STRETCHES, _CONTEXT):
+    if not drive.seen.any():
+        return settings.inflation
+    drive = _screened(with_speed(drive), settings)[1]
+    for whole, hidden, _ in bounded.stretches(drive, _HIDDEN, _STRETCHES, _CONTEXT):
         kept = _apart(hidden, settings.step)
         rough = _coarse(hidden, kept)
         found = bounded.solve([rough], settings.base)[0]
@@ -108,6 +114,15 @@ def inflation_of(drive: Grid, settings: Tube = Tube()) -> float:
     return INFLATIONS[-1] if cases else settings.inflation
 
 
+def _screened(drive: Grid, settings: Tube) -> tuple[Path, Grid]:
+    """Return the path of the elastic program, and the drive without the fixes that it cannot explain.
+
+    One wrong fix would set the half-width of all.
+    """
+    path = bounded.solve([drive], replace(settings.base, nu=_ELASTIC))[0]
+    return path, drive.masked(np.isin(drive.t, [t for t, _ in path.info.get("left_out", ())]))
+
+
 def _held(band: tuple[Floats, Floats] | None, inflation: float, found: Path, fixes: Floats) -> NDArray[np.bool_]:
     """Return which fixes lie in the tube, (n, 2); none where there is no tube."""
     if band is None:
@@ -116,7 +131,7 @@ def _held(band: tuple[Floats, Floats] | None, inflation: float, found: Path, fix
 
 
 def _solved(drive: Grid, settings: Tube) -> Path:
-    fine = bounded.solve([drive], settings.base)[0]
+    fine, drive = _screened(drive, settings)
     kept = _apart(drive, settings.step)
     rough = _coarse(drive, kept)
     found = bounded.solve([rough], settings.base)[0]
@@ -124,10 +139,11 @@ def _solved(drive: Grid, settings: Tube) -> Path:
         return fine
     half_widths = found.info["half_widths"]
     band, inflation = _band(rough, found, settings)
-    info = {**found.info, "inflation": inflation}
+    info = {**found.info, "notes": list(fine.info.get("notes", ())), "inflation": inflation}
+    info["left_out"] = fine.info.get("left_out", ())
     if band is None:
         words = "no path fits the learnt half-widths, inflated: the path of the bounded chain"
-        return replace(fine, status=Status.REDUCED, info={**info, "notes": [words]})
+        return replace(fine, status=Status.REDUCED, info={**info, "notes": [*info["notes"], words]})
     centre, half = band
     # the fine path moved by what the tube's centre is off it at the nodes of the tube
     ahead = np.column_stack((fine.east, fine.north))
@@ -138,7 +154,7 @@ def _solved(drive: Grid, settings: Tube) -> Path:
         f"the band is a tube of half-widths learnt from the log and inflated {inflation:.3g} times:"
         " sized by hidden fixes, not guaranteed"
     )
-    info["notes"] = [*info.get("notes", ()), words]
+    info["notes"] = [*info["notes"], words]
     variance = (spread / _DEVIATIONS) ** 2
     fix = float(half_widths["fix"]) * inflation / np.sqrt(3.0)
     return replace(fine, east=moved[0], north=moved[1], variance=variance, fix_variance=fix**2, info=info)
