@@ -1,12 +1,15 @@
 """Print how far off each method fills outages of real logs, and how often the half-widths of `fill` hold.
 
     python benchmarks/accuracy.py [FOLDER OF LOGS] [--starts 20] [--seed 1] [--methods linear,em] [--lengths 1,5,30]
-                                  [--tracks 10]
+                                  [--tracks 20]
 
 Nothing is told of a log: clocks, scale and bias of its sensors are found from it. The first table of each log is that
 of `halfwidth outages`; the second one, where numbers are asked of the log, sets the chain beside them, in metres and as
 a share of the error of a straight line on the same starts, since twenty random starts differ by more than methods do;
-the third hides one stretch at a time from `fill` and compares its track with the hidden fixes.
+the third hides one stretch at a time from `fill` and compares its track with the hidden fixes. The last one sets that
+track beside the single method that was best on the same starts, in hindsight, and beside straight lines: ratios of mean
+errors and of means of maxima. The best of many methods on twenty starts is partly luck, so read a ratio with the
+standard error of the differences from start to start behind it.
 """
 
 import argparse
@@ -16,8 +19,13 @@ from pathlib import Path
 import numpy as np
 
 import halfwidth as hw
+from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.frames import Frame
+from halfwidth.vehicle.grid import sampled
 from halfwidth.vehicle.outage import LENGTHS
+
+#: How much worse than the best single method `fill` may be.
+WORSE = 1.05
 
 #: Asked of the default method by the start of a log's name and by length: mean and mean of maxima, m, and those of a
 #: straight line on the starts they were asked for.
@@ -54,20 +62,22 @@ def asked_of(name, found):
     print()
 
 
-def held(log, lengths, starts, seed):
-    """Hide one stretch at a time from `fill`; print error, share inside, and width."""
+def held(log, found, lengths, most):
+    """Hide one stretch at a time from `fill`; print error, share inside, and width; return errors by length."""
     frame = Frame.of(log)
-    print(f"{'fill':12}{'tracks':>8}{'mean m':>9}{'inside':>9}{'half-width m':>14}{'s a track':>11}")
+    nodes = sampled(log, sensors=calibrated(log))
+    times = nodes.t[nodes.seen]
+    print(f"{'fill':12}{'tracks':>8}{'m':>16}{'inside':>9}{'half-width m':>14}{'s a track':>11}")
+    errors = {}
     for length in lengths:
-        begin = hw.vehicle.outages(log, (length,), starts, seed, ("linear",)).cells
-        if not begin:
-            continue
-        errors, inside, widths, seconds = [], [], [], []
-        for t0 in begin[0].start:
+        begin = next((cell.start for cell in found.cells if cell.length == length), np.empty(0))[:most]
+        means, largest, counts, inside, widths, seconds, which = [], [], [], [], [], [], []
+        for k, t0 in enumerate(begin):
             clock = time.process_time()
             track = hw.vehicle.fill(log.without(t0, t0 + length))
             seconds.append(time.process_time() - clock)
-            rows = np.flatnonzero(log.fixed & (log.t >= t0) & (log.t <= t0 + length))
+            # the fixes that `outages` compares with
+            rows = np.searchsorted(log.t, times[(times >= t0) & (times <= t0 + length)])
             at = np.searchsorted(track.t_s, log.t[rows])
             # a hidden row that is no gap of its own has no row in the track
             there = (at < len(track)) & (track.t_s[np.minimum(at, len(track) - 1)] == log.t[rows])
@@ -77,15 +87,50 @@ def held(log, lengths, starts, seed):
             off = np.column_stack(frame.to_local(track.lat_deg[at], track.lon_deg[at]))
             off -= np.column_stack(frame.to_local(log.lat_deg[rows], log.lon_deg[rows]))
             half = np.column_stack((track.east_half_m[at], track.north_half_m[at]))
-            errors.append(np.hypot(off[:, 0], off[:, 1]).mean())
+            distance = np.hypot(off[:, 0], off[:, 1])
+            means.append(distance.mean())
+            largest.append(distance.max())
+            counts.append(rows.size)
             inside.append(np.mean(np.abs(off) <= half))
             widths.append(half.mean())
-        if errors:
+            which.append(k)
+        if which:
+            errors[length] = tuple(np.array(v) for v in (which, means, largest, counts))
+            both = f"{np.average(means, weights=counts):.2f} / {np.mean(largest):.2f}"
             print(
-                f"{length:>8g} s  {len(errors):>8}{np.mean(errors):>9.2f}{np.mean(inside):>9.2f}"
+                f"{length:>8g} s  {len(which):>8}{both:>16}{np.mean(inside):>9.2f}"
                 f"{np.mean(widths):>14.2f}{np.median(seconds):>11.2f}",
                 flush=True,
             )
+    return errors
+
+
+def compared(found, errors):
+    """Print the track of `fill` beside the best single method and straight lines, on the same starts."""
+    print(
+        f"\n{'':10}{'starts':>7}{'fill':>16}{'best of the methods':>32}{'ratio':>15}{'s.e.':>7}{'linear':>18}{'ratio':>15}"
+    )
+    beyond = []
+    for length, (which, mean, largest, n) in errors.items():
+        cells = {name: found.cell(name, length) for name in found.methods}
+        means = {name: float(np.average(c.mean_error[which], weights=n)) for name, c in cells.items()}
+        tops = {name: float(c.max_error[which].mean()) for name, c in cells.items()}
+        own, top = float(np.average(mean, weights=n)), float(largest.mean())
+        best, best_top = min(means, key=means.get), min(tops, key=tops.get)
+        ratio = own / means[best], top / tops[best_top]
+        apart = mean - cells[best].mean_error[which]
+        error = apart.std(ddof=1) / np.sqrt(apart.size) / means[best] if apart.size > 1 else float("nan")
+        names = best if best == best_top else f"{best}, {best_top}"
+        line = own / means["linear"], top / tops["linear"]
+        print(
+            f"{length:>8g} s{len(which):>7}{f'{own:.2f} / {top:.2f}':>16}"
+            f"{f'{names} {means[best]:.2f} / {tops[best_top]:.2f}':>32}{f'{ratio[0]:.2f} / {ratio[1]:.2f}':>15}{error:>7.2f}"
+            f"{means['linear']:>9.2f} /{tops['linear']:>7.2f}{f'{line[0]:.2f} / {line[1]:.2f}':>15}",
+            flush=True,
+        )
+        if max(ratio) > WORSE or max(line) > 1.0:
+            beyond.append(f"{length:g} s")
+    print(f"beyond {WORSE:g} times the best single method or worse than linear: {', '.join(beyond) or 'no cell'}")
 
 
 def main():
@@ -96,7 +141,7 @@ def main():
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--methods", default=None)
     parser.add_argument("--lengths", default=",".join(f"{length:g}" for length in LENGTHS))
-    parser.add_argument("--tracks", type=int, default=10, help="stretches of each length hidden from fill")
+    parser.add_argument("--tracks", type=int, default=20, help="stretches of each length hidden from fill")
     asked = parser.parse_args()
     lengths = tuple(float(length) for length in asked.lengths.split(","))
     methods = None if asked.methods is None else asked.methods.split(",")
@@ -110,7 +155,9 @@ def main():
         print(found, end="\n\n", flush=True)
         asked_of(path.name, found)
         if asked.tracks:
-            held(log, lengths, asked.tracks, asked.seed)
+            errors = held(log, found, lengths, asked.tracks)
+            if "linear" in found.methods:
+                compared(found, errors)
 
 
 if __name__ == "__main__":

@@ -642,3 +642,88 @@ def test_growing_caps_is_advised_only_where_there_are_caps():
         est = hw.estimate(walk, record, hw.BatchLP())
         assert est.status is hw.Status.INFEASIBLE
         assert ("grow_caps" in est.info["hint"]) == advised
+
+
+def worst_rows(model, record, cost, nu):
+    """The elastic program row by row, solved by SciPy: sum c_j (s_j + sum_k max(|rho_k| - s_j, 0) / (nu N_j))."""
+    from scipy.optimize import linprog
+
+    rows = residuals(model, record)
+    M, S = rows.M.toarray(), rows.S.toarray()
+    K, n, p = *M.shape, S.shape[1]
+    rho = rows.at(np.zeros(n))
+    price = (S * (cost / (nu * np.maximum(rows.count, 1)))).sum(axis=1)
+    G = np.block([[M, -S, -np.eye(K)], [-M, -S, -np.eye(K)]])
+    ends = [(None, None)] * n + [(0, None)] * (p + K)
+    found = linprog(np.r_[np.zeros(n), cost, price], A_ub=G, b_ub=np.r_[-rho, rho], bounds=ends, method="highs")
+    assert found.status == 0
+    return found.fun
+
+
+@pytest.mark.parametrize("nu", [0.02, 0.1, 0.5, 1.0])
+def test_the_mean_of_the_worst_rows_is_least(nu):
+    model, record, _ = draw(3, F=False, T=25)
+    est = hw.estimate(model, record, BatchLP(nu=nu, objective="paper", point="optimal"))
+    assert est.status.good
+    rows = residuals(model, record)
+    s = np.r_[est.q, est.r]
+    rho = np.abs(rows.at(np.r_[est.info["x0"], est.x.ravel()]))
+    over = np.maximum(rho - rows.S @ s, 0.0)
+    value = s.sum() + (over / (nu * (rows.S @ np.maximum(rows.count, 1)))).sum()
+    assert value == pytest.approx(worst_rows(model, record, np.ones(s.size), nu), rel=1e-6)
+
+
+def outlying(nu, point="central"):
+    """A smooth walk with two outputs far off."""
+    rng = np.random.default_rng(0)
+    unknown = hw.Uniform.unknown(at_most=1000.0)
+    model = hw.Linear([[1, 1], [0, 1]], None, [[1, 0]], unknown, unknown, None, names=["p", "v"])
+    truth = np.cumsum(np.cumsum(rng.uniform(-0.1, 0.1, 80)))
+    y = truth + rng.uniform(-0.5, 0.5, 80)
+    y[[20, 50]] += 15.0
+    est = hw.estimate(model, hw.Record(range(80), y), BatchLP(nu=nu, point=point))
+    assert est.status.good
+    return est, np.abs(est.x[:, 0] - truth).mean()
+
+
+@pytest.mark.parametrize("point", ["central", "optimal"])
+def test_outliers_are_named_and_do_not_set_the_half_width(point):
+    plain, far = outlying(None, point)
+    est, near = outlying(0.1, point)
+    assert near < 0.3 * far
+    assert est.r[0] < 0.4 * plain.r[0]
+    worst = est.info["beyond"][:2]
+    assert {row["row"] for row in worst} == {20, 50}
+    assert all(row["kind"] == "output" and row["excess"] > 10 for row in worst)
+    assert "beyond" not in plain.info
+
+
+def test_a_tiny_share_is_the_worst_row():
+    plain, tiny = outlying(None, "optimal")[0], outlying(1e-4, "optimal")[0]
+    np.testing.assert_allclose(np.r_[tiny.q, tiny.r], np.r_[plain.q, plain.r], atol=1e-4)
+
+
+def test_known_half_widths_are_kept_where_the_others_are_elastic():
+    model, record, _ = draw(2, E=False, F=False, T=30)
+    known = dataclasses.replace(model, w=hw.Uniform(np.full(3, 0.31)))
+    est = hw.estimate(known, record, BatchLP(nu=0.2))
+    assert est.status.good
+    assert np.abs(est.info["w"]).max() <= 0.31 * (1 + 1e-3)
+
+
+@pytest.mark.parametrize("T", [1, 2])
+def test_elastic_programs_of_a_row_or_nothing_seen(T):
+    model, record, _ = draw(1, E=False, F=False, T=T)
+    blind = hw.Record(record.t, np.full_like(record.y, np.nan), record.u)
+    for one in (record, blind):
+        est = hw.estimate(model, one, BatchLP(nu=0.3))
+        assert np.isfinite(est.x).all()
+
+
+def test_what_elastic_programs_refuse():
+    for wrong in ({"nu": 0.0}, {"nu": 1.5}, {"nu": 0.3, "objective": "log"}, {"nu": 0.3, "point": "least_squares"}):
+        with pytest.raises(hw.errors.BadValue, match="`nu`"):
+            BatchLP(**wrong)
+    model, record, _ = draw(1)
+    with pytest.raises(hw.errors.Refused, match="of their own noise"):
+        hw.estimate(model, record, BatchLP(nu=0.3))

@@ -254,3 +254,14 @@ def test_fill_takes_them_all(tmp_path, drive):
         fill(log, method="em", limits={"speed": 20})
     with pytest.raises(hw.BadValue, match="map"):
         fill(log, roads=tmp_path / "none.geojson")
+
+
+def test_a_step_of_latitude_and_longitude_is_the_floor_of_a_fix(drive):
+    grid = sampled(drive[1])
+    coarse = replace(grid, steps={**grid.steps, "lat_deg": 1e-6, "lon_deg": 2e-6})
+    for given, lo in ((grid, 0.01), (coarse, 0.05)):
+        model = antennas.problem(given.between(20, 50), TwoAntennas())[0]
+        floor = dict(zip(model.names.y, model.e.at_least, strict=True))
+        assert floor["north"] >= lo
+    assert floor["north"] == pytest.approx(0.5e-6 * 111_200, rel=0.01)
+    assert floor["east"] == pytest.approx(1e-6 * 111_300 * np.cos(np.radians(grid.frame.lat_deg)), rel=0.01)

@@ -50,3 +50,46 @@ def test_two_fixes_are_enough_and_a_drive_without_speed_too():
     blind = dataclasses.replace(drive, has_speed=False, speed=np.zeros(len(drive)))
     for path in bounded.solve([few, blind.without(20, 22)]):
         assert path.finite or path.status is Status.STALLED
+
+
+def wrong_fix(drive, at, by):
+    return dataclasses.replace(drive, east=drive.east + np.where(np.arange(len(drive)) == at, by, 0.0))
+
+
+def test_a_wrong_fix_is_named_left_out_and_bends_nothing_where_the_worst_rows_share():
+    drive = a_drive()
+    wrong = wrong_fix(drive, 60, 12.0).without(20, 24)
+    plain, elastic = (bounded.solve([wrong], bounded.Bounded(slow=False, nu=nu))[0] for nu in (None, 0.1))
+    hidden = (drive.t >= 20) & (drive.t <= 24)
+    off = [np.hypot(p.east - drive.east, p.north - drive.north)[hidden].mean() for p in (plain, elastic)]
+    assert off[1] < 0.5
+    assert off[1] < 0.5 * off[0]
+    (t, by), = elastic.info["left_out"]  # fmt: skip
+    assert (t, by) == (drive.t[60], pytest.approx(12.0, abs=1.0))
+    assert "t = 12.0 s by 12" in elastic.info["notes"][0] or "t = 12.0 s by 11" in elastic.info["notes"][0]
+
+
+def test_a_fix_beyond_all_caps_is_found_without_being_asked():
+    path = bounded.solve([wrong_fix(a_drive(), 60, 2000.0)], bounded.Bounded(slow=False))[0]
+    assert path.status.good
+    assert [t for t, _ in path.info["left_out"]] == [12.0]
+
+
+def test_clean_fixes_all_stay():
+    path = bounded.solve([a_drive().without(20, 24)], bounded.Bounded(slow=False, nu=0.1))[0]
+    assert "left_out" not in path.info
+
+
+def test_the_share_is_chosen_by_hiding_and_none_where_nothing_can_be_hidden():
+    drive = sampled(known(40.0, rate=2.0, noise=0.1, speed_noise=0.05, yaw_noise=0.003).log)
+    found = bounded.nu_of(drive, bounded.Bounded(slow=False))
+    assert found is None or found in bounded.NUS
+    cases = bounded.stretches(drive, 5.0, 4, 10.0)
+    assert len(cases) == 4
+    for whole, hidden, out in cases:
+        assert out.any()
+        assert not hidden.seen[out].any()
+        assert (whole.seen == (hidden.seen | out)).all()
+    still = dataclasses.replace(drive, **{name: 0 * drive.t for name in ("east", "north", "speed", "yaw_rate")})
+    assert bounded.nu_of(still) is None
+    assert bounded.nu_of(drive.rows(slice(0, 2))) is None

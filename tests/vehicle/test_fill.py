@@ -114,7 +114,7 @@ def test_a_higher_level_is_wider():
     np.testing.assert_array_equal(low.lat_deg, high.lat_deg)
 
 
-@pytest.mark.parametrize("name", ["linear", "cv", "gpsins", "ctrv", "em", "paper000+ls", "paper002"])
+@pytest.mark.parametrize("name", ["linear", "cv", "gpsins", "ctrv", "em", "paper000+ls", "paper002", "ep", "cvar"])
 def test_every_method_makes_a_track(name):
     made = known(80.0, rate=5.0, noise=0.1, speed_noise=0.05, yaw_noise=0.005)
     track = sound(fill(made.log.without(40, 44), method=name))

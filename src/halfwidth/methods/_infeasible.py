@@ -79,10 +79,15 @@ def elastic(
         return None, [], []
     excess = np.zeros(task.rho.size)
     excess[rows] = found.x[task.M.shape[1] :]
-    over = np.argsort(-excess, kind="stable")
-    conflicts = [_named(task, int(k), model, record, excess[k]) for k in over[excess[over] > _ZERO]]
     core = _irreducible(task, _proof(rows, found))
-    return task.point(found.x), conflicts, [_named(task, int(k), model, record) for k in core]
+    contradiction = [_named(task, int(k), model, record) for k in core]
+    return task.point(found.x), named(task, excess, model, record), contradiction
+
+
+def named(task: "Task", excess: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
+    """Describe the rows that exceed their bounds, the worst first; `excess` (rows,) is in units of sigma."""
+    over = np.argsort(-excess, kind="stable")
+    return [_named(task, int(k), model, record, excess[k]) for k in over[excess[over] > _ZERO]]
 
 
 def _bounded(task: "Task") -> NDArray[np.intp]:

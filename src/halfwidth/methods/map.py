@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.errors import BadValue
-from halfwidth.methods._infeasible import elastic, inflation
+from halfwidth.methods._infeasible import elastic, inflation, named
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._residuals import (
     Reference,
@@ -78,6 +78,8 @@ _ZERO = 1e-5
 #: Residuals of the reference below this share of sigma are rounding: where it fits exactly they would otherwise set the
 #: size of the whole program.
 _ROUNDING = 1e-9
+#: Price of a row beyond a known half-width, in units of the dearest one beyond an unknown half-width.
+_DEAR = 1e3
 #: Steps of majorise-minimise for the logarithmic objective.
 _ROUNDS = 12
 
@@ -98,6 +100,12 @@ class BatchLP:
         estimated best; of the logarithm, of the program that ends at its optimum. Or a trajectory of the optimal face:
         that of least squares in units of sigma, inside the optimal half-widths widened by 1e-6 of sigma (1e-4 where
         that leaves too little room); or the one the solver happens to return.
+    nu : float or None
+        Elastic: every row may lie outside its half-width at a price, so that each group minimises the mean of its worst
+        fraction `nu` of rows, ``s_j + sum_k max(|w_kj| - s_j, 0) / (nu N_j)``, in place of the worst one (nu near 0);
+        1 is the mean absolute residual. The half-width is then that which 1 - nu of the rows keep;
+        ``info["beyond"]`` names the others. Known half-widths are kept. Not for ``point="least_squares"`` or
+        ``objective="log"``.
     grow_caps : bool
         Where the caps ``at_most`` of unknown half-widths leave no trajectory, double them until one fits (step 7 of
         the paper's algorithm); ``info["caps_grown"]`` says how often.
@@ -146,6 +154,7 @@ class BatchLP:
 
     objective: Literal["scaled", "paper", "log"] = "scaled"
     point: Literal["central", "least_squares", "optimal"] = "central"
+    nu: float | None = None
     grow_caps: bool = False
     solver: Literal["auto", "banded", "piqp", "highs"] = "auto"
 
@@ -157,6 +166,14 @@ class BatchLP:
         ):
             if getattr(self, name) not in allowed:
                 raise BadValue(f"`{name}` is {getattr(self, name)!r}, one of {', '.join(allowed)} was expected")
+        if self.nu is not None:
+            if not 0 < self.nu <= 1:
+                raise BadValue(f"`nu` is {self.nu!r}, a share above 0 and up to 1, or None, was expected")
+            if self.objective == "log" or self.point == "least_squares":
+                raise BadValue(
+                    f"`nu` was given with objective {self.objective!r} and point {self.point!r}",
+                    hint='BatchLP(nu=0.3, objective="scaled", point="central")',
+                )
 
     def refuses(self, model: Model) -> str | None:
         """Return why the model cannot be taken, or None."""
@@ -183,6 +200,8 @@ class BatchLP:
             )
         if model.loss is not None:
             return "`BatchLP` takes lost outputs as NaN in the record but the model has a hidden loss\nhint: loss=None"
+        if self.nu is not None and model.F is not None:
+            return "`BatchLP(nu=...)` needs outputs of their own noise but the model has `F`\nhint: nu=None"
         if self.objective == "log" and np.any(_unknown(model) & (_ends(model)[0] <= 0)):
             return (
                 "`BatchLP(objective='log')` needs a floor above 0 for every unknown half-width: the logarithm has no"
@@ -201,6 +220,8 @@ class BatchLP:
         solvers = _SOLVERS[self.solver]
         info: dict[str, Any] = {"caps_grown": 1.0}
 
+        if self.nu is not None and task.free.any():
+            return self._elastic(model, record, task, self.nu, info)
         if self.point == "central" and self.objective != "log":
             est = self._central(model, record, task, task.weights(self.objective), info)
             if est is not None:
@@ -258,6 +279,26 @@ class BatchLP:
         if info["notes"]:
             info["message"] = "; ".join([Status.OK.value, *info["notes"]])
         return self._estimate(model, record, X, s, Status.OK, info)
+
+    def _elastic(self, model: Linear, record: Record, task: "Task", nu: float, info: dict[str, Any]) -> Estimate:
+        """Minimise the mean of the worst fraction of each group: a row may exceed its half-width at a price."""
+        shifted = task.shifted(task.weights(self.objective))
+        assert shifted is not None  # there is no F
+        cost = shifted.chain.c
+        price = np.where(task.free, cost / (nu * np.maximum(task.rows.count, 1.0)), 0.0)
+        price = np.where(task.free, price, _DEAR * float(price.max()))
+        answer = structured(replace(shifted.chain, slack=price), point=self.point)
+        if not answer.status.good or not np.isfinite(answer.x).all():
+            info |= {"solver": answer.by, "notes": [], "iterations": answer.iterations}
+            return self._estimate(model, record, task.clipped(task.base.X), None, Status.STALLED, info)
+        X, s = task.clipped(answer.x.ravel()), np.clip(answer.s, task.floor, np.maximum(task.cap, task.floor))
+        info |= task.report(X, s, model, record, self._value(task, s), None)
+        excess = np.maximum(np.abs(task.rows.at(X)) - task.rows.S @ s, 0.0) / (task.rows.S @ task.base.sigma)
+        info |= {"beyond": named(task, excess, model, record)}
+        info |= {"solver": answer.by, "iterations": answer.iterations, "gap": answer.gap}
+        if info["notes"]:
+            info["message"] = "; ".join([answer.status.value, *info["notes"]])
+        return self._estimate(model, record, X, s, answer.status, info)
 
     def _minimise(self, task: "Task", solvers: Sequence[Solver]) -> tuple[Solution, Array]:
         """Return the optimal point of the chosen objective, and the costs that it is optimal for."""

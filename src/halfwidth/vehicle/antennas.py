@@ -54,8 +54,8 @@ OUTPUT_FLOORS: Mapping[str, float] = {
     "altitude": 0.05,
 }  # fmt: skip
 
-#: Streams of a log whose quantisation step raises the floor of an output.
-_STREAM = {"speed": "speed_mps", "yaw_rate": "yaw_rate_radps"}
+#: Streams of a log whose quantisation step raises the floor of an output; those of latitude and longitude do it too.
+_STREAM = {"speed": "speed_mps", "yaw_rate": "yaw_rate_radps", "altitude": "alt_m"}
 
 #: Speed above which the course of a single antenna is the azimuth, m/s.
 _MOVING = 2.0
@@ -360,6 +360,17 @@ def problem(drive: Grid, settings: TwoAntennas) -> tuple[Nonlinear, Record, Floa
     return model, Record(drive.t, np.column_stack([y[name] for name in model.names.y])), x, notes
 
 
+def _half_steps(drive: Grid) -> dict[str, float]:
+    """Return half the quantisation step of each output that has one, in the output's unit."""
+    found = {name: 0.5 * drive.steps.get(stream, 0.0) for name, stream in _STREAM.items()}
+    frame = drive.frame
+    lat, lon = (drive.steps.get(name, 0.0) for name in ("lat_deg", "lon_deg"))
+    at = frame.to_local([frame.lat_deg, frame.lat_deg + lat], [frame.lon_deg, frame.lon_deg + lon])
+    for name, p in zip(("east", "north"), at, strict=True):
+        found[name] = 0.5 * float(np.ptp(p))
+    return found
+
+
 def _model(drive: Grid, settings: TwoAntennas, baseline: Floats | None) -> Nonlinear:
     """Return the model with its floors, limits and roads."""
     antennas = 1 if baseline is None else 2
@@ -373,8 +384,8 @@ def _model(drive: Grid, settings: TwoAntennas, baseline: Floats | None) -> Nonli
     if driven:
         # the speed follows the acceleration, whose limits would mean little if it could jump besides
         q_lo[states.index("speed")], q_hi[states.index("speed")] = 1e-3, 0.02
-    steps = {name: 0.5 * drive.steps.get(stream, 0.0) for name, stream in _STREAM.items()}
-    r_lo = np.array([max(OUTPUT_FLOORS[name.rstrip("12")], steps.get(name, 0.0)) for name in outputs])
+    steps = _half_steps(drive)
+    r_lo = np.array([max(OUTPUT_FLOORS[name.rstrip("12")], steps.get(name.rstrip("12"), 0.0)) for name in outputs])
     r_hi = np.full(len(outputs), np.inf)
     lo, hi = np.full(len(states), -np.inf), np.full(len(states), np.inf)
     for name, (least, most) in settings.limits.items():

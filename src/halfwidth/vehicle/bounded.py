@@ -14,13 +14,16 @@ scale, bias     constant; within 8 % and 0.02 rad/s (Pavelková and Kárný 2013
 ==============  ===================================================================================
 
 Each round solves a linear program (`halfwidth.BatchLP`, through the core's interior point) about the azimuth of the
-round before. Half-widths have physical floors: without them the logarithmic objective has no minimum, and a half-width
-that sits on its floor is named in ``path.info``. Minimal half-widths guarantee nothing: the path has no variance of
-its own, and `fill` gives it the size that hiding fixes shows.
+round before. One wrong fix sets the half-width of all fixes: with `nu` every row may exceed its half-width at a price,
+and each group minimises the mean of its worst fraction nu (`halfwidth.BatchLP`), which `nu_of` chooses by hiding
+stretches of the same log. Fixes that are then far beyond what the others keep within are named, and left out of the
+rounds that follow. Half-widths have physical floors: without them the logarithmic objective has no minimum, and a
+half-width that sits on its floor is named in ``path.info``. Minimal half-widths guarantee nothing: the path has no
+variance of its own, and `fill` gives it the size that hiding fixes shows.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -31,7 +34,7 @@ from halfwidth.methods import load
 from halfwidth.model import Linear
 from halfwidth.noise import Uniform
 from halfwidth.record import Record
-from halfwidth.result import Status
+from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
@@ -43,6 +46,15 @@ ALONG, ACROSS, AZIMUTH, SCALE, BIAS, OFFSET_E, OFFSET_N = range(7)
 
 #: How far scale and bias change in a second, at most: the steps of the chain, three times.
 _SCALE_WALK, _BIAS_WALK = 3e-4, 3e-5
+
+
+#: A fix is left out beyond this many half-widths and metres, if no more than this share of the fixes are.
+_FAR, _FAR_M, _MOST = 4.0, 3.0, 0.1
+
+#: Shares that are compared by hiding stretches of a log, besides the worst row alone; lengths of the stretches, how
+#: many of each, and what is left around them, s.
+NUS: tuple[float, ...] = (0.03, 0.1, 0.3)
+_HIDDEN, _STRETCHES, _CONTEXT = (5.0, 20.0), 8, 20.0
 
 
 @dataclass(frozen=True)
@@ -67,6 +79,8 @@ class Bounded:
         Least half-width of a fix and of a step of its offset, m.
     scale, bias : float
         Bounds of the speed scale about 1 and of the yaw bias about 0, rad/s.
+    nu : float or None
+        Share of the worst rows whose mean counts, in place of the worst one.
     """
 
     objective: Literal["scaled", "log"] = "scaled"
@@ -79,6 +93,7 @@ class Bounded:
     fix_floor: float = 0.005
     scale: float = 0.08
     bias: float = 0.02
+    nu: float | None = None
 
 
 def solve(drives: Sequence[Grid], settings: Bounded = Bounded()) -> list[Path]:
@@ -98,6 +113,67 @@ def solve(drives: Sequence[Grid], settings: Bounded = Bounded()) -> list[Path]:
     return [_solved(with_speed(drive), settings) for drive in drives]
 
 
+def nu_of(drive: Grid, settings: Bounded = Bounded()) -> float | None:
+    """Return the share `nu` that fills hidden stretches of a drive best; None if none beats the worst row alone.
+
+    Parameters
+    ----------
+    drive : Grid
+    settings : Bounded
+
+    Returns
+    -------
+    float or None
+    """
+    cases = [case for length in _HIDDEN for case in stretches(drive, length, _STRETCHES, _CONTEXT)]
+    if not cases:
+        return None
+
+    def loss(nu: float | None) -> float:
+        # errors of short and long stretches count alike, and so do those of easy and hard places
+        paths = solve([hidden for _, hidden, _ in cases], replace(settings, nu=nu))
+        off = [
+            np.hypot(path.east - whole.east, path.north - whole.north)[out].mean()
+            for path, (whole, _, out) in zip(paths, cases, strict=True)
+        ]
+        known = np.asarray([one if np.isfinite(one) else 1e3 for one in off])
+        return float(np.mean(np.log(known + 0.01)))
+
+    return min((None, *NUS), key=loss)
+
+
+def stretches(drive: Grid, length: float, n: int, context: float) -> list[tuple[Grid, Grid, NDArray[np.bool_]]]:
+    """Hide stretches of one length, evenly spread over a drive, in which the vehicle moves.
+
+    Parameters
+    ----------
+    drive : Grid
+    length : float
+        s; shorter where the fixes span less than five times that.
+    n : int
+        How many at most.
+    context : float
+        Seconds of the drive kept on each side.
+
+    Returns
+    -------
+    list of (Grid, Grid, (T,) bool array)
+        Each as it is, with its fixes hidden, and which fixes those are.
+    """
+    fixes = drive.t[drive.seen]
+    length = min(length, (fixes[-1] - fixes[0]) / 5) if fixes.size else 0.0
+    if length < 1.0:
+        return []
+    found = []
+    for begin in np.linspace(fixes[0] + length, fixes[-1] - 2 * length, n).tolist():
+        whole = drive.between(begin - context, begin + length + context)
+        hidden = whole.without(begin, begin + length)
+        out = whole.seen & ~hidden.seen
+        if out.any() and hidden.seen.sum() > 3 and (not drive.has_speed or np.abs(whole.speed[out]).mean() > 1.0):
+            found.append((whole, hidden, out))
+    return found
+
+
 def _solved(drive: Grid, settings: Bounded) -> Path:
     psi = azimuth_of(drive)
     y = np.column_stack((drive.east, drive.north))
@@ -105,11 +181,16 @@ def _solved(drive: Grid, settings: Bounded) -> Path:
     y -= origin
     y[~drive.seen] = np.nan
     best: Path | None = None
+    beyond = np.zeros(drive.t.size)
+    method = load("BatchLP")(objective=settings.objective, point=settings.point, nu=settings.nu)
     for _ in range(settings.rounds):
-        model, u, turn = _model(drive, psi, settings)
-        est = estimate(
-            model, Record(drive.t, y, u), load("BatchLP")(objective=settings.objective, point=settings.point)
-        )
+        model, u, turn = linearised(drive, psi, settings)
+        est = estimate(model, Record(drive.t, y, u), method)
+        if est.status is Status.INFEASIBLE:
+            # half-widths at their caps do not explain some fix: where every row may exceed them it stands out
+            elastic = estimate(model, Record(drive.t, y, u), load("BatchLP")(nu=_MOST))
+            if _leave_out(elastic, y, beyond):
+                est = estimate(model, Record(drive.t, y, u), method)
         sound = bool(np.isfinite(est.x).all())
         if not sound or (best is not None and not est.status.good):
             break
@@ -126,12 +207,37 @@ def _solved(drive: Grid, settings: Bounded) -> Path:
             est.x[:, SCALE] * at_node,
             None,
             status=est.status if est.status.good else Status.STALLED,
-            info=_info(model, est.q, est.r, est.x),
+            info=_info(model, est.q, est.r, est.x) | _left_out(drive, beyond),
         )
+        if settings.nu is not None:
+            _leave_out(est, y, beyond)
     if best is None:
         nothing = np.full(drive.t.size, np.nan)
         return Path(drive.t, nothing, nothing, nothing, nothing, None, status=Status.STALLED)
     return best
+
+
+def _leave_out(est: Estimate, y: Floats, beyond: Floats) -> bool:
+    """Take away the fixes y (T, 2) that are far beyond their half-width, note how far, and return whether any are."""
+    if not est.status.good or est.r is None:
+        return False
+    off = np.nan_to_num(np.abs(est.info["e"])).max(axis=1)
+    wrong = off > max(_FAR * float(est.r.max()), _FAR_M)
+    if not wrong.any() or wrong.sum() > _MOST * np.isfinite(y[:, 0]).sum():
+        return False
+    beyond[wrong], y[wrong] = off[wrong], np.nan
+    return True
+
+
+def _left_out(drive: Grid, beyond: Floats) -> dict[str, object]:
+    """Return fixes that were left out, with time and how far off they are, m, the worst first."""
+    k = np.argsort(-beyond)[: int((beyond > 0).sum())]
+    if not k.size:
+        return {}
+    words = ", ".join(f"t = {drive.t[i]:.1f} s by {beyond[i]:.1f} m" for i in k[:5])
+    more = f" and {k.size - 5} more" if k.size > 5 else ""
+    found = tuple((float(drive.t[i]), float(beyond[i])) for i in k)
+    return {"left_out": found, "notes": [f"no bounded noise explains these fixes, left out: {words}{more}"]}
 
 
 def _info(model: Linear, q: Floats | None, r: Floats | None, x: Floats) -> dict[str, object]:
@@ -150,8 +256,8 @@ def _info(model: Linear, q: Floats | None, r: Floats | None, x: Floats) -> dict[
     }
 
 
-def _model(drive: Grid, psi: Floats, settings: Bounded) -> tuple[Linear, Floats, Floats]:
-    """Return the model about azimuths psi, its input, and the matrices (T, 2, 2) from its axes to east and north."""
+def linearised(drive: Grid, psi: Floats, settings: Bounded) -> tuple[Linear, Floats, Floats]:
+    """Return the chain about azimuths psi, its input, and the matrices (T, 2, 2) from its axes to east and north."""
     h, v, w = drive.h, drive.speed, drive.yaw_rate
     T = h.size
     middle = psi.copy()

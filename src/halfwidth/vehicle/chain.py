@@ -491,5 +491,38 @@ def _fit(rows: _Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: 
     return Fit(sigma, share[part].copy(), z, P, float(out.loglik[i]), path)
 
 
+def learnt_noise(drive: Grid, fit: Fit, settings: Chain = Chain()) -> tuple[Floats, Floats, Floats]:
+    """Return the noise of each step that a fit found, for estimators that look at the same residuals otherwise.
+
+    Parameters
+    ----------
+    drive : Grid
+        The drive of the fit, with a speed (`with_speed`).
+    fit : Fit
+    settings : Chain
+
+    Returns
+    -------
+    sd : (T, 9) array
+        Standard deviations of the residuals along and across the way and of the yaw, of the increments of scale, bias,
+        offset east and north, drift east and north.
+    extra : (T, 3) array
+        Variances that come on top of the first three where sensors were silent.
+    start : (9,) array
+        Variances of the same before the first node; of the position, of how far it may be.
+    """
+    rows, s2 = _rows([drive]), fit.sigma[None] ** 2
+    h, own = rows.h, s2[rows.drive]
+    residuals = np.column_stack(_variances(rows, own)) - rows.extra
+    walks = np.column_stack((settings.scale_walk**2 * h, settings.bias_walk**2 * h))
+    offset = own[:, OFFSET] * h / fit.weight
+    drift = own[:, DRIFT] * h
+    sd = np.sqrt(np.column_stack((residuals, walks, offset, offset, drift, drift)))
+    slow, drifts = (float(v[0]) for v in _stationary(s2, settings))
+    far = float(rows.far[0]) ** 2
+    start = np.array([far, far, 10.0, settings.scale_sd**2, settings.bias_sd**2, slow, slow, drifts, drifts])
+    return sd, rows.extra, start
+
+
 #: The core's code for a belief that left the range of floating point.
 _BROKEN = 3

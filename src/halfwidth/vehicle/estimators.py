@@ -11,9 +11,12 @@ ctrv          constant turn rate and velocity, extended Kalman smoother, with sp
 em            the chain of `halfwidth.vehicle.chain`, the default of `fill`
 em-slow       the same, the fix error a Gaussian offset without drift and jumps
 em-white      the same, the fix error white noise
+ep            the posterior of that chain where noise is partly bounded: half-widths by evidence (`credible`)
 slp           the same with bounded noise by sequential linear programming, central point (`bounded`)
 slp-white     the same, the fix error without an offset
 slp-log       that with the logarithmic objective
+cvar          slp-white that counts the mean of the worst rows in place of the worst one, how many by masking
+tube          the centre of the set of all paths within learnt half-widths, inflated by masking (`tube`)
 paper000      GPS/INS by linear programming, half-widths unknown, as printed in Pavelková (2011)
 paper000+ls   the same, least squares inside the optimal half-widths
 paper002      GPS and CAN of Pavelková's slides: nonlinear, two antennas or one, logarithmic objective, floors
@@ -38,7 +41,7 @@ from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Normal
-from halfwidth.vehicle import antennas, bounded, chain, models
+from halfwidth.vehicle import antennas, bounded, chain, credible, models, tube
 from halfwidth.vehicle.antennas import TwoAntennas
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid
@@ -383,6 +386,18 @@ def _bounded(settings: bounded.Bounded) -> Callable[[Sequence[Grid], Tuned], lis
     return lambda drives, tuned: bounded.solve(drives, settings)  # noqa: ARG005
 
 
+def _credible(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:  # noqa: ARG001
+    return credible.solve(drives)
+
+
+def _worst_share(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
+    return bounded.solve(drives, bounded.Bounded(slow=False, nu=tuned["nu"] or None))
+
+
+def _tube(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
+    return tube.solve(drives, tube.Tube(inflation=tuned["inflation"]))
+
+
 #: What the chain may take the error of a fix for; the first is the usual one.
 COLOURS: Mapping[str, chain.Chain] = MappingProxyType(
     {
@@ -409,6 +424,7 @@ METHODS: Mapping[str, Method] = MappingProxyType(
                 )
                 for name, words in (("em", ""), ("em-slow", ", slow fix error"), ("em-white", ", white fix error"))
             ),
+            Method("ep", "posterior of the chain, noise partly bounded", 60.0, (), _credible, one_of=_SENSORS),
             *(
                 Method(name, f"chain with bounded noise{words}", 20.0, (), _bounded(settings), one_of=_SENSORS)
                 for name, words, settings in (
@@ -416,6 +432,24 @@ METHODS: Mapping[str, Method] = MappingProxyType(
                     ("slp-white", ", no fix offset", bounded.Bounded(slow=False)),
                     ("slp-log", ", log objective", bounded.Bounded(objective="log", slow=False)),
                 )
+            ),
+            Method(
+                "cvar",
+                "chain with bounded noise, mean of the worst rows",
+                20.0,
+                (),
+                _worst_share,
+                lambda drive: {"nu": bounded.nu_of(drive, bounded.Bounded(slow=False)) or 0.0},
+                one_of=_SENSORS,
+            ),
+            Method(
+                "tube",
+                "centre of the tube of bounded noise",
+                20.0,
+                (),
+                _tube,
+                lambda drive: {"inflation": tube.inflation_of(drive)},
+                one_of=_SENSORS,
             ),
             Method(
                 "paper000",
