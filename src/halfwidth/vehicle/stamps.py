@@ -15,7 +15,6 @@ The log decides: its rows are moved only if its fixes then fit its own speed bet
 """
 
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,4 +180,4 @@ def _fits_better(log: Log, said: Floats) -> bool:
         scale = float(np.median(moved[moving] / (pace * h)[moving]))
         return float(np.median(np.abs(moved - scale * pace * h)[told]))
 
-    return off(cast(Floats, new)) < BETTER * off(step)
+    return off(new) < BETTER * off(step)
