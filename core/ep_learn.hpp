@@ -3,7 +3,7 @@
 // phi = log s of the free half-widths, logit eps last if it is learned. The prior of a rate is a beta law. That of log s is
 // s^power told^reference on (floor, cap), told^2 = mean over the rows of (1 - posterior variance / (s^2 / 3))^2: the square
 // root of what a row tells of log s (Jeffreys) and a power, 0 where the noise drowns and steady where it is seen. It has
-// no scale of its own. log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the
+// no scale of its own. What other data have told is a term pull'u - u'precision u / 2 beside it, u = s^warp. log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the
 // four lanes one holds phi, three hold phi + h e_j, whose slopes give three columns of the Hessian, other coordinates at
 // the next step. Around the mode, `nodes` points phi + H^(-1/2) z_k are evaluated and weighted by evidence over
 // proposal; the answer is their mixture. A half-width that may as well be 0 has an exponential tail in log s and none in a
@@ -57,16 +57,44 @@ struct EpLearner {
         return std::sqrt(min2(max2(f.learned[group[j]][l] / max2(a.count[group[j]], 1.0), 1e-12), 1.0));
     }
     double log_prior(const double* phi, int l) const {
-        double p = 0.0;
+        double p = known(phi);
         for (int j = 0; j < q; j++)
             p += group[j] >= 0 ? (a.power - a.warp) * phi[j] + a.reference * std::log(told(j, l))
                                : a.beta_a * phi[j] - (a.beta_a + a.beta_b) * std::log1p(std::exp(phi[j]));
         return p;
     }
     // What is told grows with s^2 / (s^2 + what blurs it), so d log told / d log s = 2 (1 - told), near enough for a search.
-    double prior_slope(int j, double phi, int l) const {
-        return group[j] >= 0 ? a.power - a.warp + 2.0 * a.reference * (1.0 - told(j, l))
-                             : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi));
+    double prior_slope(int j, const double* phi, int l) const {
+        return group[j] >= 0 ? a.power - a.warp + 2.0 * a.reference * (1.0 - told(j, l)) + known_slope(j, phi)
+                             : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi[j]));
+    }
+
+    // What is known already of the half-widths: its logarithm up to a constant, its slope in log s_j, and minus the
+    // curvature of the Gaussian in it.
+    double power_of(int j, const double* phi) const { return std::exp(a.warp * phi[j]); }
+    double precision(int i, int j) const { return a.precision[group[i] * a.base.groups + group[j]]; }
+    double known(const double* phi) const {
+        double p = 0.0;
+        if (a.pull)
+            for (int i = 0; i < q; i++)
+                if (group[i] >= 0) {
+                    double half = a.pull[group[i]];
+                    for (int j = 0; j < q; j++)
+                        if (group[j] >= 0) half -= 0.5 * precision(i, j) * power_of(j, phi);
+                    p += half * power_of(i, phi);
+                }
+        return p;
+    }
+    double known_slope(int i, const double* phi) const {
+        if (!a.pull) return 0.0;
+        double d = a.pull[group[i]];
+        for (int j = 0; j < q; j++)
+            if (group[j] >= 0) d -= precision(i, j) * power_of(j, phi);
+        return a.warp * power_of(i, phi) * d;
+    }
+    double known_curve(int i, int j, const double* phi) const {
+        if (!a.pull || group[i] < 0 || group[j] < 0) return 0.0;
+        return a.warp * a.warp * power_of(i, phi) * power_of(j, phi) * precision(i, j);
     }
 
     // parameters of lane l
@@ -113,7 +141,7 @@ struct EpLearner {
             if (!sound) dirty = true;
             value[l] = sound ? f.log_z[l] + log_prior(phi[l], l) : minus_inf;
             for (int j = 0; j < q; j++)
-                slope[l][j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l] + prior_slope(j, phi[l][j], l);
+                slope[l][j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l] + prior_slope(j, phi[l], l);
         }
     }
 
@@ -182,7 +210,10 @@ struct EpLearner {
     int climb(double* phi, double (*H)[ep_free], double* best, bool warm) {
         double column[ep_free][ep_free] = {}, g[ep_free] = {};
         bool measured[ep_free] = {};
-        for (int j = 0; j < q; j++) column[j][j] = max2(group[j] >= 0 ? 0.3 * a.count[group[j]] : 1.0, a.least);
+        for (int j = 0; j < q; j++) {
+            for (int i = 0; i < q; i++) column[j][i] = known_curve(i, j, phi);
+            column[j][j] += max2(group[j] >= 0 ? 0.3 * a.count[group[j]] : 1.0, a.least);
+        }
         int next = 0, missing = q;
         *best = minus_inf;
         double d[ep_free] = {}, trial[ep_free];
@@ -394,7 +425,10 @@ struct EpLearner {
             evaluate(at, a.most, a.tol_nodes, value, slope);
             ep.shapes(b.k3, b.k4);
             for (int l = 0; l < lanes && k + l < nodes; l++) {
-                for (int j = 0; j < q; j++) a.phi[(k + l) * q + j] = at[l][j];
+                for (int j = 0; j < q; j++) {
+                    a.phi[(k + l) * q + j] = at[l][j];
+                    a.node_slope[(k + l) * q + j] = f.slope[group[j] >= 0 ? group[j] : b.groups][l];
+                }
                 double lw = inside[l] && value[l] > minus_inf ? value[l] - (nodes > 1 ? a.log_proposal[k + l] : 0.0) : minus_inf;
                 a.log_weight[k + l] = lw;
                 if (lw == minus_inf) continue;
