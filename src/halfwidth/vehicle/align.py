@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth.vehicle import evidence, reckoning
+from halfwidth.vehicle import evidence, reckoning, rolling
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import STREAMS, Log
@@ -81,14 +81,19 @@ def calibrated(log: Log, *, clock_offset: float | None = None) -> Calibration:
     known = replace(known, still=standstills(log, replace(known, offsets=start)))
     grid = sampled(log)
     parts = _parts(grid)
-    streams = {name: replace(known, offsets={}, still=AS_LOGGED.still).stream(log, name) for name in _SENSORS}
+    plain = replace(known, offsets={}, still=AS_LOGGED.still)
+    streams: reckoning.Streams = {name: plain.stream(log, name) for name in _SENSORS}
     if "speed" not in there:
-        streams["speed"] = _speed_of_fixes(grid)
+        streams = {**streams, "speed": _speed_of_fixes(grid)}
     solved = [_solved(part, streams, known, rough, first, fixed=given.given) for part in parts]
     pieces = [piece for piece in solved if piece.sound]
     if not pieces:
         return known
     known = _joined(known, pieces, there, given)
+    rolled = _wheels(log, parts, streams, known, solved, given)
+    if rolled is not None:
+        known, streams, solved = rolled
+        pieces = [piece for piece in solved if piece.sound]
     off = _antenna(parts, streams, known, solved, given)
     if off is not None:
         known = off
@@ -396,6 +401,42 @@ def _offset(pieces: Sequence[reckoning.Piece], k: int, mean: float, sd: float) -
         first, last = ((float(x), float(slope[0] + slope[1] * (x - t.mean()))) for x in (ends[0, 0], ends[-1, 1]))
         return Offset(float(slope[0]), sd, True, (first, last), "drift")
     return constant
+
+
+def _wheels(
+    log: Log,
+    parts: Sequence[Grid],
+    streams: reckoning.Streams,
+    known: Calibration,
+    solved: Sequence[reckoning.Piece],
+    given: Offset,
+) -> tuple[Calibration, reckoning.Streams, list[reckoning.Piece]] | None:
+    """Take the speed for that of wheels ahead of the rear axle; return what that gives if the log shows them."""
+    if not {"speed", "yaw_rate"} <= set(known.offsets):
+        return None
+    ahead = rolling.wheels([(part, piece) for part, piece in zip(parts, solved, strict=True) if piece.sound], streams)
+    if ahead is None:
+        return None
+    known = replace(known, wheels=ahead[0], wheels_sd=ahead[1])
+    t, speed = streams["speed"]
+    rolled = known.at_axle(log, known.offsets["speed"].moved(t), known.scale * speed) / known.scale
+    streams = {**streams, "speed": (t, rolled)}
+    again = [
+        reckoning.solve(
+            part,
+            streams,
+            _still(part, known),
+            (float(piece.mean[1]), float(piece.mean[2])),
+            fixed_clocks=given.given,
+            rounds=_MORE,
+            start=piece,
+        )
+        if piece.sound
+        else piece
+        for part, piece in zip(parts, solved, strict=True)
+    ]
+    sound = [piece for piece in again if piece.sound]
+    return (_joined(known, sound, tuple(known.offsets), given), streams, again) if sound else None
 
 
 def _antenna(

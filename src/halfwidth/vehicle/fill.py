@@ -1,6 +1,7 @@
 """Fill a drive: a position with a half-width for every row of a log that had, or could have had, a fix.
 
-The log is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
+A log that was written late is put at the times at which its sensors spoke (`stamps`); the track has the stamps of the
+log. It is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
 gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened or
 narrowed by what hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate
 too are tested by hiding these as well, and bridged by constant velocity where hidden fixes show that to be better;
@@ -37,6 +38,7 @@ from halfwidth.vehicle.path import Path, sized
 from halfwidth.vehicle.roads import roads_of
 from halfwidth.vehicle.slow import Slow, slow_error
 from halfwidth.vehicle.spikes import spikes
+from halfwidth.vehicle.stamps import Stamps, restamped
 from halfwidth.vehicle.stray import strays
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
 
@@ -147,6 +149,11 @@ def fill(
         doubtful = distrusted(drive_log, jumps=not sensed)
         messages.extend(doubtful.words(drive_log))
         drive_log = doubtful.masked(drive_log)
+    # a second antenna's log is on the clock of the first one as written
+    stamps = Stamps(drive_log.t, drive_log.t)
+    if beside is None:
+        drive_log, stamps = restamped(drive_log)
+    messages.extend(filter(None, [stamps.words()]))
     drive_log = _with_pauses_filled(drive_log, messages)
     sensors = calibrated(drive_log, clock_offset=None if clock_offset is None else offset)
     messages.extend(sensors.words())
@@ -171,7 +178,8 @@ def fill(
     arm_east, arm_north = sensors.arm(t)
     east, north = columns.east + arm_east, columns.north + arm_north
     lat, lon = grid.frame.to_geodetic(east, north)
-    gaps = gaps_of(t, lat, lon, half.max(axis=1), quality)
+    written = stamps.back(t)
+    gaps = gaps_of(written, lat, lon, half.max(axis=1), quality)
     settings: dict[str, object] = {"context": CONTEXT, "sensors": sensors.to_dict()}
     settings.update(answers.settings)
     band = None
@@ -179,7 +187,7 @@ def fill(
         off = np.isin(t, grid.t[believed & ~grid.seen])  # what is not believed bounds nothing
         band = _proven(drive_log, wanted, off, grid, np.column_stack((east, north)), bounds, messages)
     return Track(
-        t_s=t,
+        t_s=written,
         lat_deg=lat,
         lon_deg=lon,
         alt_m=_altitude(drive_log, t, answers.paths),
@@ -188,10 +196,10 @@ def fill(
         east_half_m=half[:, 0],
         north_half_m=half[:, 1],
         quality=quality,
-        since_fix_s=since_fix_of(t, quality),
+        since_fix_s=since_fix_of(written, quality),
         level=level,
         method=chosen.name,
-        log=drive_log,
+        log=replace(drive_log, t=stamps.back(drive_log.t)),
         gaps=gaps,
         # where nothing could be tested, a model's own variance is a size and no probability
         guarantee="credible" if all(bridge.tested for bridge in answers.bridges) else "none",

@@ -8,7 +8,8 @@ apart, inside the interval at `level` of a method that claims one: its own inter
 hiding fixes shows. `held` is the share inside once each outage's interval is sized by the other outages of its length
 that do not overlap with it, as `fill` sizes gaps by stretches elsewhere in the log.
 
-Clocks and scales of the sensors are found from the whole log, hidden fixes included: a handful of numbers.
+Clocks and scales of the sensors are found from the whole log, hidden fixes included: a handful of numbers. A log that
+was written late is put right before (`stamps`), and a fix counts at the time at which it was taken.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,6 +28,7 @@ from halfwidth.vehicle.estimators import METHODS, Method, method, usable
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log, to_frame
 from halfwidth.vehicle.path import Path, sized
+from halfwidth.vehicle.stamps import restamped
 
 Floats = NDArray[np.float64]
 
@@ -434,7 +436,7 @@ def outages(
         raise BadValue(f"`starts` is {starts!r}, a whole number from 1 is expected", hint="starts=20")
     level = level_of(level)
     offset = None if clock_offset is None else clock_offset_of(clock_offset)
-    drive_log: Log = as_log(log)[0]
+    drive_log: Log = restamped(as_log(log)[0])[0]
     chosen = [method(name) for name in (METHODS if methods is None else methods)]
     sensors = calibrated(drive_log, clock_offset=offset)
     drive = sampled(drive_log, sensors=sensors)

@@ -4,7 +4,7 @@ A `Calibration` is what `halfwidth.vehicle.align` finds, as plain values. `Calib
 as it would be had the sensor been perfect:
 
     time      = stamp + offset(stamp)
-    speed     = scale * factor * logged speed
+    speed     = scale * factor * logged speed, and what it is at the rear axle: sqrt(speed^2 - (wheels * yaw rate)^2)
     yaw rate  = factor * logged yaw rate - bias(time),      0 while the car stands
 
 Offsets and bias may change along the drive: they are given at some times and taken to go straight in between.
@@ -87,6 +87,9 @@ class Calibration:
         and to the left of it; standard deviations.
     antenna_observable : bool
         Whether the log tells it; if not it is taken to sit at that point.
+    wheels, wheels_sd : float
+        How far ahead of the rear axle the wheels are whose speed is logged, m: in turns they go further than it does;
+        0 where the log does not show it. Standard deviation.
     course_error : float
         What the receiver's azimuth adds to that of the path, rad; NaN where there is none.
     steps : mapping of str to float
@@ -118,6 +121,8 @@ class Calibration:
     antenna: tuple[float, float] = (0.0, 0.0)
     antenna_sd: tuple[float, float] = (float("inf"), float("inf"))
     antenna_observable: bool = False
+    wheels: float = 0.0
+    wheels_sd: float = float("inf")
     course_error: float = float("nan")
     steps: Mapping[str, float] = field(default_factory=dict)
     still: Floats = field(default_factory=lambda: np.empty((0, 2)), repr=False)
@@ -149,13 +154,21 @@ class Calibration:
             ahead = np.concatenate(([-np.inf], np.maximum.accumulate(t)[:-1]))
             t, values = t[t > ahead], values[t > ahead]
         if name == "speed":
-            values = self.speed_factor * self.scale * values
+            values = self.at_axle(log, t, self.speed_factor * self.scale * values)
         elif name == "yaw_rate":
             values = self.yaw_factor * values - self.bias_of(t)
             values = np.where(self.stands(t), 0.0, values)
         elif name == "azimuth" and np.isfinite(self.course_error):
             values = values - self.course_error
         return t, values
+
+    def at_axle(self, log: Log, t: Floats, speed: Floats) -> Floats:
+        """Return the speed of the rear axle at times (n,) on the clock of the fixes, from that of the wheels, m/s."""
+        clock, rate = self.stream(log, "yaw_rate") if self.wheels else (t, t)
+        if not self.wheels or clock.size == 0:
+            return speed
+        swing = self.wheels * np.interp(t, clock, rate)
+        return np.asarray(np.sign(speed) * np.sqrt(np.maximum(speed**2 - swing**2, 0.0)))
 
     def bias_of(self, t: Floats) -> Floats:
         """Return the bias of the gyro at times (n,) on the clock of the fixes, rad/s."""
@@ -191,6 +204,8 @@ class Calibration:
             found.append(f"speed scale {self.scale:.4f} +- {self.scale_sd:.4f}")
         if np.isfinite(self.bias_sd):
             found.append(f"yaw bias {self.bias:+.4f} +- {self.bias_sd:.4f} rad/s")
+        if self.wheels:
+            found.append(f"speed of wheels {self.wheels:.2f} +- {self.wheels_sd:.2f} m ahead of the rear axle")
         if self.antenna_observable:
             ahead, left = self.antenna
             found.append(
@@ -225,6 +240,8 @@ class Calibration:
             "antenna": list(self.antenna),
             "antenna_sd": [_finite(sd) for sd in self.antenna_sd],
             "antenna_observable": self.antenna_observable,
+            "wheels": self.wheels,
+            "wheels_sd": _finite(self.wheels_sd),
             "course_error": _finite(self.course_error),
             "steps": dict(self.steps),
             "standstill_s": float(np.sum(self.still[:, 1] - self.still[:, 0])),

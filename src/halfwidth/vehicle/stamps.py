@@ -1,0 +1,183 @@
+"""Time stamps of a logger that falls behind: the times at which the sensors spoke, not those at which it wrote.
+
+Many loggers stamp a sample when it arrives. A busy one writes late and catches up later: the fixes of a 10 Hz receiver
+then stand 0.3 s apart for a while and 0.08 s apart after that, and every path that multiplies a speed by such a step is
+wrong by metres. But a sensor with a clock of its own speaks every T seconds, and nothing is written before it was said.
+So the latest times that allow for both,
+
+    said[k] = min(written[k], said[k + 1] - T),
+
+are those at which the samples were taken, up to one delay that they all share, which is the clock offset of
+`halfwidth.vehicle.align`. T is taken a little too short, so that a clock that runs fast cannot add up. Lost samples do
+no harm: where nothing presses, the stamp stays as it is.
+
+The log decides: its rows are moved only if its fixes then fit its own speed better.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.vehicle import evidence
+from halfwidth.vehicle.log import STREAMS, Log
+
+Floats = NDArray[np.float64]
+
+#: Samples that a stream needs, and over how many of them its period is measured.
+FEWEST, SPAN = 100, 50
+
+#: Share by which the period is taken too short, and share of the time in which samples must come at their usual rate.
+SLACK, REGULAR = 2e-3, 0.9
+
+#: Steps between fixes that must have changed, by this share of the period, for the log to decide; how much nearer the
+#: speed must come to the fixes there.
+CHANGED, BY, BETTER = 20, 0.05, 0.9
+
+#: Rows may not pass fixes; where they would have to by more than this share of the period the streams are late each by
+#: itself, and stay as they are.
+_CROSSING = 1.0
+
+_FIX = ("lat_deg", "lon_deg", "alt_m", "azimuth_rad")
+
+
+@dataclass(frozen=True, eq=False)
+class Stamps:
+    """Times of the rows of a log as written, and as said.
+
+    Parameters
+    ----------
+    written, said : (N,) arrays
+        Strictly increasing, s; equal where nothing was moved.
+    """
+
+    written: Floats
+    said: Floats
+
+    @property
+    def moved(self) -> bool:
+        """Whether any row was."""
+        return bool(np.any(self.written != self.said))
+
+    def back(self, t: Floats) -> Floats:
+        """Return the stamps of times (n,) as said: exactly those of the log at its rows."""
+        if not self.moved:
+            return t
+        late = np.interp(t, self.said, self.written - self.said)
+        at = np.minimum(np.searchsorted(self.said, t), self.said.size - 1)
+        return np.where(self.said[at] == t, self.written[at], t + late)
+
+    def words(self) -> str:
+        """Say what was done; empty where nothing was."""
+        late = self.written - self.said
+        worst = int(np.argmax(late))
+        return (
+            f"the log was written up to {late[worst]:.2f} s late (at {self.written[worst]:.0f} s): samples are taken at"
+            " the regular times of their sensors, as the fixes then fit the speed better"
+            if self.moved
+            else ""
+        )
+
+
+def restamped(log: Log) -> tuple[Log, Stamps]:
+    """Put the rows of a log at the times at which its sensors spoke.
+
+    Parameters
+    ----------
+    log : Log
+
+    Returns
+    -------
+    log : Log
+        The same rows; the same log where its streams are not regular, its stamps are, or its fixes and speed do not
+        speak for moving them.
+    stamps : Stamps
+        The way back.
+    """
+    said = _said(log)
+    if said is None or not _fits_better(log, said):
+        return log, Stamps(log.t, log.t)
+    return replace(log, t=said), Stamps(log.t, said)
+
+
+def delays(t: Floats) -> tuple[Floats, float]:
+    """Return how late each sample of a stream was written, (n,), s, and the period of the stream.
+
+    Zero, and a period of zero, where the stream is not regular.
+    """
+    nothing = np.zeros(t.size), 0.0
+    if t.size < FEWEST:
+        return nothing
+    period = float(np.quantile((t[SPAN:] - t[:-SPAN]) / SPAN, 0.25))
+    # single steps jitter; ten in a row take ten periods
+    ten = (t[10:] - t[:-10]) / (10.0 * period)
+    if np.mean(np.abs(ten - 1.0) < 0.25) < REGULAR:
+        return nothing
+    return t - _latest(t, period), period
+
+
+def _latest(written: Floats, period: float) -> Floats:
+    """Return the latest times (n,), s, that are a period apart and not after those written."""
+    ramp = np.arange(written.size) * period * (1.0 - SLACK)
+    said: Floats = np.minimum.accumulate((written - ramp)[::-1])[::-1] + ramp
+    return np.minimum(said, written)
+
+
+def _said(log: Log) -> Floats | None:
+    """Return the times at which the rows of a log were said, strictly increasing; None where nothing is to move."""
+    fixed = np.flatnonzero(log.fixed)
+    late_fix, period = delays(log.t[fixed])
+    if not period:
+        return None
+    late, known = np.full(len(log), np.inf), np.zeros(len(log), dtype=bool)
+    for name in STREAMS:
+        rows = np.flatnonzero(np.isfinite(getattr(log, name)))
+        if name not in _FIX and rows.size >= FEWEST:
+            late[rows] = np.minimum(late[rows], delays(log.t[rows])[0])
+            known[rows] = True
+    if not known.any():
+        known[fixed], late[fixed] = True, late_fix
+    late = np.interp(log.t, log.t[known], late[known])
+    # beside a gap the fixes that are missing press no longer: there the others say how late the logger was
+    pressed = np.where(late[fixed] > late_fix + 0.5 * period, late[fixed], 0.0)
+    said = log.t - late
+    said[fixed] = _latest(log.t[fixed] - pressed, period)
+    if np.max(log.t - said) < BY * period:
+        return None
+    # the rows between two fixes stay between them, in their order
+    after = np.searchsorted(fixed, np.arange(len(log)))
+    ends = np.concatenate(([-np.inf], said[fixed], [np.inf]))
+    room = 0.01 * period
+    held = np.clip(said, ends[after] + room, np.maximum(ends[after + 1] - room, ends[after] + room))
+    held[fixed] = said[fixed]
+    if np.abs(held - said).max() > _CROSSING * period:
+        return None
+    held = np.maximum.accumulate(held)
+    first = np.concatenate(([True], np.diff(held) > 0))
+    run = np.arange(held.size) - np.maximum.accumulate(np.where(first, np.arange(held.size), 0))
+    held = held + run * (room / (10.0 * (run.max() + 1.0)))
+    return held if bool((np.diff(held) > 0).all()) else None
+
+
+def _fits_better(log: Log, said: Floats) -> bool:
+    """Whether the distances between neighbouring fixes are nearer to speed times time once the rows are moved."""
+    rows = np.flatnonzero(log.fixed)
+    clock, speed = log.stream("speed_mps")
+    if clock.size < FEWEST:
+        return False
+    east, north = evidence.local_metres(log.lat_deg[rows], log.lon_deg[rows])
+    moved = np.hypot(np.diff(east), np.diff(north))
+    usual = float(np.median(np.diff(log.t[rows])))
+    pace = np.interp(log.t[rows], clock, np.abs(speed))
+    pace = 0.5 * (pace[1:] + pace[:-1])
+    step, new = np.diff(log.t[rows]), np.diff(said[rows])
+    moving = pace > 1.0
+    told = (np.abs(new - step) > BY * usual) & moving
+    if int(told.sum()) < CHANGED:
+        return False
+
+    def off(h: Floats) -> float:
+        scale = float(np.median(moved[moving] / (pace * h)[moving]))
+        return float(np.median(np.abs(moved - scale * pace * h)[told]))
+
+    return off(new) < BETTER * off(step)
