@@ -5,10 +5,11 @@ window i is, about its posterior, a quadratic in u = s^(1/2),
 
     log Z_i(u) ~ pull_i' u - u' H_i u / 2,    H_i = -Cov(g, u) Cov(u)^-1,    pull_i = E g + H_i E u,
 
-where g is the slope of log Z_i and the moments are those of the posterior over u (the nodes of `Posterior`). A row lies in as
-many windows as a window has rows, N: each window counts 1 / N, and only once **all** of its rows have left, so no row
-speaks twice and the prior of the newest window holds none of its own data. The sum of overlapping window likelihoods is a composite
-likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by exp(-1 / rows) a row.
+where g is the slope of log Z_i and the moments are those of the posterior over u (the nodes of `Posterior`). A row lies
+in as many windows as a window has rows, N: each window counts 1 / N, and only once **all** of its rows have left, so no
+row speaks twice and the prior of the newest window holds none of its own data. The sum of overlapping window
+likelihoods is a composite likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by
+exp(-1 / rows) a row.
 
 The state before the first row of a window is what the sites of the rows that have left make of it: the forwards message
 of expectation propagation, a Gaussian.
@@ -113,7 +114,7 @@ def told(answer: "Answer") -> Known:
 
 
 def messages(chain: Sites, sites: tuple[Array, ...], stages: int) -> list[tuple[Array, Array]]:
-    """Return mean and covariance of x_0 .. x_stages given what lies up to each alone, by the sites of a solved chain."""
+    """Return mean and covariance of x_0 .. x_stages, each given what lies up to it, by the sites of a solved chain."""
     p = chain.problem
     n = len(p["m0"])
     m, D = (np.asarray(v).reshape(-1, n) for v in sites[:2])
@@ -219,7 +220,9 @@ class Carried:
     def load(self, saved: dict[str, Any]) -> None:
         """Take up what `save` returned."""
         self.gone = Known(*(np.array(v, dtype=float) for v in saved["gone"]))
-        self.waiting = [(int(k), Known(np.array(h, dtype=float), np.array(H, dtype=float))) for k, h, H in saved["waiting"]]
+        self.waiting = [
+            (int(k), Known(np.array(h, dtype=float), np.array(H, dtype=float))) for k, h, H in saved["waiting"]
+        ]
         self.s = None if saved["s"] is None else np.array(saved["s"], dtype=float)
         first, edge = saved["first"], saved["edge"]
         self.first = None if first is None else Normal(*first)

@@ -221,7 +221,9 @@ class Sliding:
                 return solved
         est = method.run(model, part, seed=self.seed) if self.carried is None else self._posterior(model, part, a)
         s = np.full(model.nx + model.ny, np.nan) if est.q is None or est.r is None else np.r_[est.q, est.r]
-        info = {k: v for k, v in est.info.items() if k in ("solver", "objective", "notes", "message", "gap")}
+        info = {
+            k: v for k, v in est.info.items() if k in ("solver", "objective", "notes", "message", "gap", "half_widths")
+        }
         return Solved(
             np.vstack([est.info.get("x0", self.x[a]), est.x]), np.zeros(0) if est.theta is None else est.theta, s,
             est.status, int(est.info.get("iterations", 0) or 0), info, rows_of_spread(est.spread, slice(-1, None)),
@@ -230,8 +232,9 @@ class Sliding:
     def _posterior(self, model: Model, part: Record, a: int) -> Estimate:
         """Estimate one window with what the rows before it told."""
         held, method = self.carried, self.window.method
-        assert held is not None and isinstance(method, Posterior)
-        seen = part.seen.any(axis=1)
+        assert held is not None
+        assert isinstance(method, Posterior)
+        seen = np.atleast_1d(part.seen.any(axis=1))
         answer = method.resumed(model, part, held.s, held.known(self.first + a))
         newest = self.first + len(self.times) - 1
         rows = max(int(seen.sum()), self.window.memory + 1)
