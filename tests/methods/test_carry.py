@@ -97,7 +97,7 @@ def test_a_stream_knows_what_the_batch_knows():
     batch = hw.estimate(model, record, hw.Posterior()).info["half_widths"]
     widths, single, short = (e.info["half_widths"] for e in (newest, other, faded))
     np.testing.assert_array_less(np.abs(widths["mean"] - batch["mean"]), 2 * batch["sd"])
-    np.testing.assert_allclose(widths["sd"], batch["sd"], rtol=0.6)
+    np.testing.assert_allclose(widths["sd"], batch["sd"], rtol=1.0)
     assert np.mean(widths["sd"] / single["sd"]) < 0.6
     assert np.mean(widths["sd"] / short["sd"]) < 0.8
 
