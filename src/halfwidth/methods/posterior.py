@@ -47,6 +47,9 @@ _LIMITS = {
     "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.25, "least": 0.3,
     "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
 }  # fmt: skip
+#: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone shape
+#: the path. In longer records bounds are a condition in the others.
+_EVENT = 52
 #: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
 #: with them; there is less left to integrate.
 _LONG = 2000
@@ -252,6 +255,7 @@ class Posterior:
         q = int(chain.free.sum()) + learn_rate
         z, log_proposal = nodes(q, self.nodes if q else 1)
         limits = dict(_LIMITS)
+        limits["condition"] = max(0.0, 1.0 - _EVENT / max(len(chain.problem["start"]) - 2, 1))
         rows = max(float(chain.count.sum()), 1.0)
         limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
         limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
@@ -268,7 +272,7 @@ class Posterior:
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
                 learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z, log_proposal,
                 limits, sites_, was, None if known is None else known.pull,
-                None if known is None else known.precision,
+                None if known is None else known.precision, chain.outside if limits["condition"] > 0 else None,
             )
         )  # fmt: skip
 
