@@ -49,7 +49,7 @@ _LIMITS = {
 }  # fmt: skip
 #: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone shape
 #: the path. In longer records bounds are a condition in the others.
-_EVENT = 52
+_EVENT = 26
 #: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
 #: with them; there is less left to integrate.
 _LONG = 2000
