@@ -52,7 +52,7 @@ TOL = 1e-8
 
 
 class Solved(NamedTuple):
-    """One window: states (rows + 1, nx), theta, half-widths (nx + ny,), how it went, and the newest state's spread."""
+    """One window: states (rows + 1, nx), theta, half-widths (nx + ny,), how it went, and the spread of its rows."""
 
     x: Array
     theta: Array
@@ -174,6 +174,10 @@ class Sliding:
         self._forget(a, seen)
         return solved
 
+    def back(self) -> int:
+        """Return how many rows ago the state is that is asked for: `lag`, or that of the first row."""
+        return min(self.window.lag, self.pushed - 1)
+
     def _note(self, k: int, x: Array, last: NDArray[np.int32]) -> None:
         self.x[k] = x
         if k == len(self.low):
@@ -226,7 +230,7 @@ class Sliding:
         }
         return Solved(
             np.vstack([est.info.get("x0", self.x[a]), est.x]), np.zeros(0) if est.theta is None else est.theta, s,
-            est.status, int(est.info.get("iterations", 0) or 0), info, rows_of_spread(est.spread, slice(-1, None)),
+            est.status, int(est.info.get("iterations", 0) or 0), info, est.spread,
         )  # fmt: skip
 
     def _posterior(self, model: Model, part: Record, a: int) -> Estimate:
@@ -405,10 +409,12 @@ class Live:
         solved = held.push(*pushed_row(model, y, u, dt))
         low, high, windows = held.ahead.bounds()
         good, nx = solved.status.good and np.isfinite(solved.s).all(), model.nx
+        back = held.back()
+        ago = slice(-1 - back, -back or None)
         return Estimate(
-            np.array([held.t]),
-            held.x[-1][None].copy(),
-            solved.spread,
+            np.array(held.times[ago]),
+            held.x[-1 - back][None].copy(),
+            None if solved.spread is None else rows_of_spread(solved.spread, ago),
             solved.status,
             self.method,
             q=solved.s[:nx].copy() if good else None,
