@@ -230,7 +230,7 @@ def streams():
     show("stream, Delta 25, E and F", stream_case(25, correlated=True))
 
 
-def known():
+def against_draws():
     """Compare with the sampler where half-widths are known."""
     model = system(hw.Uniform(Q), hw.Uniform(R))
     count = min(WINDOWS, 50)
@@ -263,7 +263,9 @@ def table():
 def windows_alone():
     """Print errors, coverage and learned half-widths of windows on their own."""
     known = system(hw.Uniform(Q), hw.Uniform(R))
-    print(f"{WINDOWS} windows on their own; half-widths unknown (truth .1 .1 .1 .3 .3); mean absolute errors over the three states")
+    print(
+        f"{WINDOWS} windows on their own; half-widths unknown (truth .1 .1 .1 .3 .3); mean absolute errors over the three states"
+    )
     print(
         " " * 31, "filter    KF ratio     mid     KF ratio   covered at 50 80 90 95 %          learned s   bad  CPU ms"
     )
@@ -421,12 +423,12 @@ def calibration():
 
 def main():
     """Run what is asked for."""
-    known = {
-        "table": table, "windows": windows_alone, "streams": streams, "known": known, "priors": priors, "ensemble": ensemble, "outliers": outliers, "robust": robust,
+    studies = {
+        "table": table, "windows": windows_alone, "streams": streams, "known": against_draws, "priors": priors, "ensemble": ensemble, "outliers": outliers, "robust": robust,
         "calibration": calibration,
     }  # fmt: skip
     for name in sys.argv[1:] or ["table"]:
-        known[name]()
+        studies[name]()
 
 
 if __name__ == "__main__":

@@ -339,9 +339,9 @@ def biased_quantile(bias: Array, level: float) -> Array:
 class Shaped:
     """The state has these moments: a Gaussian bent by skewness and kurtosis.
 
-    Quantiles are those of the beta law (Pearson's type I) with the same four moments: between two ends, as bounded noise
-    leaves a state, and flatter than a Gaussian. Tails heavier than any beta law has follow from the expansion of
-    Cornish and Fisher (1938).
+    Quantiles are those of the beta law (Pearson's type I) with the same four moments: between two ends, as bounded
+    noise leaves a state, and flatter than a Gaussian. Tails heavier than those of any beta law follow from the
+    expansion of Cornish and Fisher (1938).
 
     Parameters
     ----------

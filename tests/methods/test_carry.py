@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import halfwidth as hw
-from halfwidth.methods._carry import Carried, Known, messages, told
+from halfwidth.methods._carry import Carried, Known, inside, messages, told
 from halfwidth.methods._sites import sites
 
 A = np.array([[1, -0.5, 0.2], [0.5, 0.1, 0], [0.3, 0, -0.1]])
@@ -185,3 +185,65 @@ def test_a_gaussian_lag_is_the_smoother_with_that_lag():
     window = hw.estimate(model, record, hw.Window(hw.Posterior(), memory=5, fixes=0, lag=3))
     np.testing.assert_allclose(window.x, whole.x, atol=1e-9)
     np.testing.assert_allclose(window.P, whole.P, atol=1e-9)
+
+
+NARROW = hw.Box([-0.8, -0.61, -0.4], [0.76, 0.66, 0.44])
+
+
+def confined(T, seed, many=3000):
+    """Return a record of a path of those that stay inside `NARROW`, from the genealogy of particles."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-0.3, 0.3, (many, 3))
+    X, parent = [x], []
+    for _ in range(T):
+        x = x @ A.T + rng.uniform(-0.3, 0.3, (many, 3))
+        alive = np.flatnonzero(NARROW.contains(x))
+        parent.append(alive[rng.integers(len(alive), size=many)])
+        x = x[parent[-1]]
+        X.append(x)
+    k, path = 0, []
+    for t in range(T, 0, -1):
+        path.append(X[t][k])
+        k = parent[t - 1][k]
+    return hw.Record(np.arange(1.0, T + 1), np.array(path[::-1]) @ C.T + rng.uniform(-0.3, 0.3, (T, 2)))
+
+
+def test_bounds_do_not_shrink_half_widths():
+    model = system(hw.Uniform.unknown(at_most=2.0), hw.Uniform(0.3), NARROW, bounds=NARROW)
+    found = np.array([hw.estimate(model, confined(300, seed), hw.Posterior(nodes=16)).q for seed in range(4)])
+    assert found[:, :2].mean() == pytest.approx(0.3, rel=0.12)
+
+
+def test_the_evidence_of_bounds_alone():
+    model = system(hw.Uniform.unknown(at_most=2.0), hw.Uniform(0.3), NARROW, bounds=NARROW)
+    record = hw.Record(np.arange(1.0, 4.0), np.zeros((3, 2)))
+    chain = sites(model, record)
+    s = np.array([0.3, 0.3, 0.3, 0.3, 0.3])
+    known = inside(chain, s)
+
+    def share(s):  # of paths that stay inside, by the same draws
+        rng = np.random.default_rng(1)
+        x, kept = rng.uniform(NARROW.lo, NARROW.hi, (200_000, 3)), np.ones(200_000, dtype=bool)
+        for _ in range(3):
+            x = x @ A.T + s[:3] * rng.uniform(-1, 1, x.shape)
+            kept &= NARROW.contains(x)
+        return np.log(kept.mean())
+
+    for j in range(3):
+        more, less = s.copy(), s.copy()
+        more[j], less[j] = 0.36, 0.25
+        ours = [known.pull @ np.sqrt(v) - 0.5 * np.sqrt(v) @ known.precision @ np.sqrt(v) for v in (more, less)]
+        assert ours[0] - ours[1] == pytest.approx(share(more) - share(less), abs=0.05)
+    assert inside(sites(system(UNKNOWN, UNKNOWN), record), s).precision.any() == np.False_
+
+
+def test_a_forecast_has_outputs():
+    _, record = drawn(60, 3)
+    F = np.array([[1, 0.4], [0, 1]])
+    for e in (UNKNOWN, hw.Uniform(0.3) + hw.Gaussian(0.01)):
+        model = hw.Linear(A, None, C, hw.Uniform(0.1), e, BOX, F=F)
+        ahead = hw.forecast(model, record, 3, method=hw.Posterior())
+        back = np.linalg.inv(F)
+        R = np.diag(np.asarray(ahead.r) ** 2 / 3 + (0.01 if e is not UNKNOWN else 0.0))
+        np.testing.assert_allclose(ahead.info["y"], ahead.x @ (back @ C).T)
+        np.testing.assert_allclose(ahead.info["S"][2], back @ (C @ ahead.P[2] @ C.T + R) @ back.T)

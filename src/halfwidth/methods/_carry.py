@@ -11,9 +11,9 @@ row speaks twice and the prior of the newest window holds none of its own data. 
 likelihoods is a composite likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by
 exp(-1 / rows) a row.
 
-Bounds are a condition on what is carried: as a mere factor of the evidence they count as an event that small half-widths
-make likely, and over many windows that adds up. A quadratic of log P(inside | u), the evidence of the chain with its
-bounds alone, is taken off for every N-th window, N times as heavy.
+Bounds are a condition on what is carried: as a mere factor of the evidence they count as an event that small
+half-widths make likely, and over many windows that adds up. A quadratic of log P(inside | u), the evidence of the
+chain with its bounds alone, is taken off for every N-th window, N times as heavy.
 
 The state before the first row of a window is what the sites of the rows that have left make of it: the forwards message
 of expectation propagation, a Gaussian.
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 #: Power of a half-width in which its posterior is nearly Gaussian: 0 is no tail there.
 WARP = 0.5
-#: Sweeps of the chain with its bounds alone, and the log share of a cavity inside a bound below which it is not believed.
+#: Sweeps of the chain with its bounds alone, and the log share of a cavity inside a bound from which it is believed.
 _SWEEPS, _WORST = 50, -60.0
 
 

@@ -79,14 +79,14 @@ class Window:
         For ``Posterior``: what rows that have left the window told of half-widths and of the state at its edge is
         carried on; of half-widths it fades over `recall` times memory + 1 rows. 0 takes every window on its own.
     lag : int
-        Row t uses the outputs up to row t + lag, at most `memory`: each push of a stream gives the estimate of `lag` rows
-        ago.
+        Row t uses the outputs up to row t + lag, at most `memory`: each push of a stream gives the estimate of `lag`
+        rows ago.
 
     Notes
     -----
-    ``x[k]`` is the state of row k in the window that ends at row k + `lag`, or at the last one. In ``info``: ``smoothed`` (T, nx), the last
-    estimate of each state; ``low``, ``high`` and ``windows``, what `ensemble_interval` needs; ``q``, ``r``, ``theta``
-    of every window; ``start``, ``extrapolated``, ``since_fix``, ``statuses``, ``iterations`` and, of ``BatchLP``,
+    ``x[k]`` is the state of row k in the window that ends at row k + `lag`, or at the last one. In ``info``:
+    ``smoothed`` (T, nx), the last estimate of each state; ``low``, ``high`` and ``windows``, what `ensemble_interval`
+    needs; ``q``, ``r``, ``theta`` of every window; ``start``, ``extrapolated``, ``since_fix``, ``statuses``, ``iterations`` and, of ``BatchLP``,
     ``seconds`` of CPU time of every row; ``newest_low``, ``newest_high``, ``newest_windows``, what
     ``ensemble_interval(newest=True)`` needs. Those of the estimate itself are the last window's; its status is
     the worst of all windows.
