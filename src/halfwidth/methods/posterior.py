@@ -101,7 +101,8 @@ class Posterior:
     ``q``, ``r`` are posterior means. ``loglik`` is the logarithm of the evidence, half-widths integrated out under a
     prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
     count as a factor in 26 rows and as a condition in the others. In ``info``: ``x0``; ``half_widths``, a mapping
-    with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %) of (q, r); ``outliers``, the named outputs with a probability above one half; ``residual``,
+    with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %) of (q, r); ``outliers``, the named outputs with a
+    probability above one half; ``residual``,
     the disagreement of moments in standard deviations, the largest of each node; ``sweeps``; ``nodes`` and their
     ``effective`` number.
 
