@@ -1,10 +1,14 @@
 """Accuracy and coverage of `Posterior` on the system of Pavelková and Kárný (2013), sec. 6.
 
-    python benchmarks/posterior.py [table] [priors] [ensemble] [outliers] [robust] [calibration]
+    python benchmarks/posterior.py [table] [windows] [streams] [known] [priors] [ensemble] [outliers] [robust] [calibration]
 
-Paths stay inside the boxes by rejection of whole paths. The Kalman filter is told the true covariances, sees 15 rows
-more of the past and is clipped to the boxes; `Posterior` sees windows of `Delta` + 1 rows and is told no half-width. Long
-records, where whole paths cannot be rejected, redraw the disturbances that would leave the boxes, which is another law. Without arguments the table is printed. `WINDOWS=500` sets the number of windows.
+Paths stay inside the boxes by rejection of whole paths. The Kalman filter is told the true covariances and is clipped to
+the boxes. `windows`: each window of `Delta` + 1 rows on its own, told no half-width and nothing of the past, of which the
+Kalman filter sees 15 rows. `streams`: long paths by `Window(Posterior())`, which carries what it has learned, against the
+Kalman filter on the same rows, after a burn-in of 200 rows; whole paths of that length cannot be rejected, so one is the
+genealogy of a particle among 5,000 that are resampled from those inside at every row. `table` is both; without arguments
+it is printed. The other studies redraw disturbances that would leave the boxes, which is another law. `WINDOWS=500` sets
+the number of windows; streams have six times as many.
 """
 
 import os
@@ -18,6 +22,7 @@ import numpy as np  # noqa: E402
 
 import halfwidth as hw  # noqa: E402
 from halfwidth.methods import posterior  # noqa: E402
+from halfwidth.methods._sliding import Sliding  # noqa: E402
 from halfwidth.reproduce.paper003 import BOX, KAPPA, A, B, C, E, F, Q, R  # noqa: E402
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
@@ -88,6 +93,29 @@ def windows(delta, count, seed, *, correlated=False, missing=0.0):
     return found
 
 
+def stays(rng, rows, *, correlated=False, many=5_000):
+    """Return states (rows + 1, 3) and inputs of one long path of those that stay inside the box."""
+    G = np.linalg.inv(E) if correlated else np.eye(3)
+    x = rng.uniform(BOX.lo, BOX.hi, (many, 3))
+    X, U, parent = [x], [], []
+    for _ in range(rows):
+        u = rng.uniform(-1, 1, (many, 1))
+        x = (x @ A.T + u @ B.T + rng.uniform(-Q, Q, (many, 3))) @ G.T
+        alive = np.flatnonzero(((x >= BOX.lo) & (x <= BOX.hi)).all(axis=1))
+        from_ = alive[rng.integers(len(alive), size=many)]
+        x = x[from_]
+        X.append(x)
+        U.append(u[from_])
+        parent.append(from_)
+    k, path, inputs = 0, [], []
+    for t in range(rows, 0, -1):
+        path.append(X[t][k])
+        inputs.append(U[t - 1][k])
+        k = parent[t - 1][k]
+    path.append(X[0][k])
+    return np.array(path[::-1]), np.array(inputs[::-1])
+
+
 def told_the_truth(record, *, correlated):
     """Kalman filter with the true covariances, clipped to the boxes."""
     noise = hw.Gaussian(np.full(3, Q**2 / 3)), hw.Gaussian(np.full(2, R**2 / 3))
@@ -132,18 +160,114 @@ def show(name, c):
     """Print one row of the table."""
     cover = " ".join(f"{v:5.1f}" for v in c["coverage"])
     print(
-        f"{name:<26} {c['filter']:.4f} {c['kf']:.4f} {c['ratio']:5.2f}  {c['mid']:.4f} {c['kf mid']:.4f} {c['mid ratio']:5.2f}"
+        f"{name:<31} {c['filter']:.4f} {c['kf']:.4f} {c['ratio']:5.2f}  {c['mid']:.4f} {c['kf mid']:.4f} {c['mid ratio']:5.2f}"
         f"  {cover}  (+-{c['error of it'].max():.1f})  {' '.join(f'{v:.3f}' for v in c['s'])}  {c['bad']:3d}  {c['ms']:6.1f}",
         flush=True,
     )
 
 
-def table():
-    """Print errors, coverage and learned half-widths."""
+BURN_IN, LONG = 200, 700
+
+
+def stream_case(delta, *, correlated=False, missing=0.0, seed=11, model=None, recall=40.0):
+    """Return the same of windows along long paths, at the filter's end and at mid-window."""
+    unknown = hw.Uniform.unknown(at_most=1.0)
+    model = system(unknown, unknown, correlated=correlated) if model is None else model
+    mid = (delta + 1) // 2
+    kept = slice(BURN_IN + mid, LONG)
+    error, theirs, covered, s, seconds, bad = [], [], [], [], 0.0, 0
+    paths = max(1, round(6 * WINDOWS / (LONG - BURN_IN)))
+    for path in range(paths):
+        rng = np.random.default_rng([seed, path])
+        X, u = stays(rng, LONG, correlated=correlated)
+        y = X[1:] @ C.T + rng.uniform(-R, R, (LONG, 2))
+        if correlated:
+            y = y @ np.linalg.inv(F).T
+        y[rng.random(y.shape) < missing] = np.nan
+        record = hw.Record(np.arange(1.0, LONG + 1), y, u)
+        kf = told_the_truth(record, correlated=correlated)
+        rows = Sliding(hw.Window(hw.Posterior(nodes=32), delta, recall=recall), model, 0.0)
+        off, hit, learned = [], [], []
+        for t in range(LONG):  # what `lag=0` and `lag=mid` give, in one run
+            start = time.process_time()
+            solved = rows.push(record.y[t], record.u[t], 1.0)
+            seconds += time.process_time() - start
+            bad += not solved.status.good
+            if t < BURN_IN + mid:
+                continue
+            ends = [solved.spread.interval(q) for q in LEVELS]
+            pairs = [(-1, X[t + 1]), (-1 - mid, X[t + 1 - mid])]
+            off.append([np.abs(solved.x[k] - x).mean() for k, x in pairs])
+            hit.append([[((x >= lo[k]) & (x <= hi[k])).mean() for lo, hi in ends] for k, x in pairs])
+            learned.append(solved.s)
+        both = list(zip(np.mean(off, axis=0), np.mean(hit, axis=0), strict=True))
+        error.append([e for e, _ in both])
+        theirs.append(np.abs(kf - X[1:])[kept].mean())
+        covered.append([h for _, h in both])
+        s.append(np.nanmean(learned, axis=0))
+    error, theirs, covered = np.array(error), np.mean(theirs), np.array(covered)
+    middle = covered.mean(axis=1)
+    return {
+        "filter": error[:, 0].mean(), "kf": theirs, "ratio": error[:, 0].mean() / theirs,
+        "mid": error[:, 1].mean(), "kf mid": theirs, "mid ratio": error[:, 1].mean() / theirs,
+        "coverage": 100 * middle.mean(axis=0), "error of it": 100 * middle.std(axis=0) / np.sqrt(paths),
+        "at the end": 100 * covered[:, 0].mean(axis=0), "s": np.mean(s, axis=0), "bad": bad,
+        "ms": 1e3 * seconds / (paths * LONG),
+    }  # fmt: skip
+
+
+def streams():
+    """Print errors, coverage and learned half-widths of windows that carry what they have learned."""
     known = system(hw.Uniform(Q), hw.Uniform(R))
-    print(f"{WINDOWS} windows; half-widths unknown (truth .1 .1 .1 .3 .3); mean absolute errors over the three states")
     print(
-        " " * 26, "filter    KF ratio     mid     KF ratio   covered at 50 80 90 95 %          learned s   bad  CPU ms"
+        f"along {max(1, round(6 * WINDOWS / (LONG - BURN_IN)))} paths of {LONG} rows, the first {BURN_IN} left out; "
+        "coverage: mean of the filter's end and mid-window"
+    )
+    for delta in (5, 25, 50):
+        show(f"stream, Delta {delta}", stream_case(delta))
+        show(f"stream, Delta {delta}, told q, r", stream_case(delta, model=known))
+    show("stream, Delta 25, 20 % missing", stream_case(25, missing=0.2))
+    show("stream, Delta 25, E and F", stream_case(25, correlated=True))
+
+
+def against_draws():
+    """Compare with the sampler where half-widths are known."""
+    model = system(hw.Uniform(Q), hw.Uniform(R))
+    count = min(WINDOWS, 50)
+    off, ratio, held = [], [], []
+    for k, (_, _, part) in enumerate(windows(25, count, 7)):
+        est = hw.estimate(model, part, hw.Posterior())
+        draws = hw.estimate(model, part, hw.Posterior(method="sample", draws=1000), seed=k)
+        points = draws.spread.points
+        sd = points.std(axis=1)
+        off.append(np.abs(est.x - points.mean(axis=1)) / sd)
+        ratio.append(est.spread.sd / sd)
+        ends = [est.interval(q) for q in LEVELS]
+        held.append([((points >= lo[:, None]) & (points <= hi[:, None])).mean() for lo, hi in ends])
+    off, ratio = np.array(off), np.array(ratio)
+    low, high = np.percentile(ratio, [2.5, 97.5])
+    print(
+        f"{count} windows of Delta 25 with known half-widths against draws: means off by {off.mean():.3f} sd on average, "
+        f"{off.max():.3f} at most; sd ratio {ratio.mean():.3f}, 95 % of them {low:.3f} to {high:.3f}, all "
+        f"{ratio.min():.3f} to {ratio.max():.3f}; share of draws inside intervals of 50 80 90 95 %: "
+        + " ".join(f"{100 * v:.1f}" for v in np.mean(held, axis=0))
+    )
+
+
+def table():
+    """Print both tables."""
+    windows_alone()
+    streams()
+
+
+def windows_alone():
+    """Print errors, coverage and learned half-widths of windows on their own."""
+    known = system(hw.Uniform(Q), hw.Uniform(R))
+    print(
+        f"{WINDOWS} windows on their own; half-widths unknown (truth .1 .1 .1 .3 .3); mean absolute errors over the three states"
+    )
+    print(
+        " " * 31, "filter    KF ratio     mid     KF ratio   covered at 50 80 90 95 %          learned s   bad  CPU ms"
     )
     for delta in (5, 25, 50):
         show(f"Delta {delta}", one_case(delta))
@@ -299,12 +423,12 @@ def calibration():
 
 def main():
     """Run what is asked for."""
-    known = {
-        "table": table, "priors": priors, "ensemble": ensemble, "outliers": outliers, "robust": robust,
+    studies = {
+        "table": table, "windows": windows_alone, "streams": streams, "known": against_draws, "priors": priors, "ensemble": ensemble, "outliers": outliers, "robust": robust,
         "calibration": calibration,
     }  # fmt: skip
     for name in sys.argv[1:] or ["table"]:
-        known[name]()
+        studies[name]()
 
 
 if __name__ == "__main__":

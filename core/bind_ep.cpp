@@ -216,8 +216,10 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
 nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale, In start, In count, bool learn_eps,
                double rate, double start_eps, double power, double beta_a, double beta_b, In z, In log_proposal,
                const nb::dict& limits, std::optional<nb::tuple> sites, std::optional<In> was, std::optional<In> pull,
-               std::optional<In> precision) {
+               std::optional<In> precision, std::optional<nb::dict> outside) {
     Problem p(problem, 4);
+    std::optional<Problem> bounds;
+    if (outside) bounds.emplace(*outside, 4);
     hw::EpLearnArgs l{};
     hw::EpArgs& a = p.a;
     const std::size_t stages = a.T + 1, n = a.n, rows = a.rows, groups = a.groups;
@@ -264,6 +266,7 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     l.narrow = real("narrow");
     l.warp = real("warp");
     l.reference = real("reference");
+    l.condition = real("condition");
     a.damping = real("damping");
     nb::dict found;
     found["sites"] = p.sites(sites, 1);
@@ -277,6 +280,12 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     a.k3 = of_lanes[2];
     a.k4 = of_lanes[3];
     a.out = outliers ? of_lanes[4] : nullptr;
+    if (bounds) {
+        want(bounds->a.T == a.T && bounds->a.n == a.n && bounds->a.groups == a.groups, "outside: another chain");
+        bounds->a.x = a.x;
+        bounds->a.P = a.P;
+        l.outside = &bounds->a;
+    }
     found["mode"] = fresh({q}, &l.mode);
     found["H"] = fresh({q, q}, &l.H);
     found["phi"] = fresh({nodes, q}, &l.phi);
@@ -324,5 +333,6 @@ void bind_ep(nb::module_& mod) {
     mod.def("ep_learn", &learn, "problem"_a, "free"_a, "floor"_a, "cap"_a, "scale"_a, "start"_a, "count"_a, "learn_eps"_a,
             "rate"_a, "start_eps"_a, "power"_a, "beta_a"_a, "beta_b"_a, "z"_a, "log_proposal"_a, "limits"_a,
             "sites"_a.none(), "was"_a.none(), "pull"_a.none() = nb::none(), "precision"_a.none() = nb::none(),
+            "outside"_a.none() = nb::none(),
             "The same with half-widths found by evidence and what is not known of them carried into the answer.");
 }

@@ -113,7 +113,7 @@ int run(N n, const EpArgs& a) {
 template <class N>
 int learn(N n, const EpLearnArgs& a) {
     Ep<N> ep{n, a.base, {0, lanes - 1}, {}, {}};
-    EpLearner<N> learner{ep, a, {}, nullptr, nullptr, nullptr, nullptr, nullptr, 0, {}, {}, {}, 0, false};
+    EpLearner<N> learner{ep, a};
     Place place{reinterpret_cast<V*>(a.base.work)};
     settle_in(ep, learner.f, place);
     const std::ptrdiff_t size = std::ptrdiff_t(a.base.T + 1) * n;
@@ -122,6 +122,14 @@ int learn(N n, const EpLearnArgs& a) {
     learner.keep_tau = place.take(a.base.rows);
     learner.keep_nu = place.take(a.base.rows);
     learner.was = place.take(a.base.groups + 1);
+    if (!a.outside) return learner.run();
+    Ep<N> outside{n, *a.outside, {0, lanes - 1}, {}, {}};
+    settle_in(outside, learner.fo, place);
+    learner.out_m = place.take(size);
+    learner.out_D = place.take(size);
+    learner.out_tau = place.take(a.outside->rows);
+    learner.out_nu = place.take(a.outside->rows);
+    learner.outside = &outside;
     return learner.run();
 }
 
@@ -141,8 +149,10 @@ int ep_run(const EpArgs& a) {
 }
 
 std::size_t ep_learn_workspace(const EpLearnArgs& a) {
-    const std::size_t more = 2 * std::size_t(a.base.T + 1) * a.base.n + 2 * std::size_t(a.base.rows) + a.base.groups + 1;
-    return ep_workspace(a.base) + more * lanes;
+    const std::size_t sites = 2 * std::size_t(a.base.T + 1) * a.base.n;
+    const std::size_t more = sites + 2 * std::size_t(a.base.rows) + a.base.groups + 1;
+    const std::size_t own = ep_workspace(a.base) + more * lanes;
+    return a.outside ? own + ep_workspace(*a.outside) + (sites + 2 * std::size_t(a.outside->rows)) * lanes : own;
 }
 
 int ep_learn(const EpLearnArgs& a) {

@@ -59,6 +59,8 @@ struct EpArgs {
 // (its m, D, tau, nu hold one: the mode's, on the way in too if it is warm).
 struct EpLearnArgs {
     EpArgs base;
+    const EpArgs* outside;                   // the chain with its bounds alone, or null
+    double condition;                        // power of its evidence that the chain's is divided by
     const bool* free;                        // (groups,)
     const double *floor, *cap, *scale;       // (groups,): bounds, and the order of size
     const double *start, *was;               // (groups,): first guess; half-widths of warm sites

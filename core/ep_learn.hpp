@@ -9,6 +9,10 @@
 // proposal; the answer is their mixture. A half-width that may as well be 0 has an exponential tail in log s and none in a
 // power of s, so the search and the nodes live in u = s^warp (its density has the prior s^(a-warp) in log s, and at its
 // mode the two Hessians differ by du/dphi only). Sites follow phi from point to point, so a point costs few sweeps.
+//
+// Bounds as a factor count as an event that small half-widths make likely: within few rows that keeps half-widths from
+// growing until bounds alone shape the path, over hundreds it shrinks them. So Z(phi) is divided by a power, `condition`,
+// of the evidence of the chain with its bounds alone (`outside`): with the power 1 bounds are a condition.
 #pragma once
 
 #include "ep.hpp"
@@ -22,12 +26,15 @@ template <class N>
 struct EpLearner {
     Ep<N>& ep;
     const EpLearnArgs& a;
-    EpFound f;
-    V *keep_m, *keep_D, *keep_tau, *keep_nu;  // sites of the best point
-    V* was;                                   // (groups,)
+    EpFound f{};
+    V *keep_m = nullptr, *keep_D = nullptr, *keep_tau = nullptr, *keep_nu = nullptr;  // sites of the best point
+    V* was = nullptr;                         // (groups,)
+    Ep<N>* outside = nullptr;                 // bounds alone, or null
+    EpFound fo{};
+    V *out_m = nullptr, *out_D = nullptr, *out_tau = nullptr, *out_nu = nullptr;  // its sites of the best point
     int q = 0;                                // parameters
-    int group[ep_free];                       // half-width of a parameter, -1: the rate
-    double lo[ep_free], hi[ep_free];
+    int group[ep_free] = {};                  // half-width of a parameter, -1: the rate
+    double lo[ep_free] = {}, hi[ep_free] = {};
     long sweeps = 0;
 
     std::ptrdiff_t stage_count() const { return static_cast<std::ptrdiff_t>(a.base.T + 1) * ep.n; }
@@ -100,8 +107,10 @@ struct EpLearner {
     // parameters of lane l
     void put(int l, const double* phi) {
         for (int j = 0; j < q; j++) {
-            if (group[j] >= 0) ep.s.s[group[j]].set(l, std::exp(phi[j]));
-            else ep.s.eps.set(l, 1.0 / (1.0 + std::exp(-phi[j])));
+            if (group[j] >= 0) {
+                ep.s.s[group[j]].set(l, std::exp(phi[j]));
+                if (outside) outside->s.s[group[j]].set(l, std::exp(phi[j]));
+            } else ep.s.eps.set(l, 1.0 / (1.0 + std::exp(-phi[j])));
         }
     }
     void remember(int l) {
@@ -114,6 +123,17 @@ struct EpLearner {
             keep_nu[k] = V(ep.s.nu[k][l]);
         }
         for (int g = 0; g < a.base.groups; g++) was[g] = V(ep.s.s[g][l]);
+        if (outside) remember_outside(l);
+    }
+    void remember_outside(int l) {
+        for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
+            out_m[k] = V(outside->s.m[k][l]);
+            out_D[k] = V(outside->s.D[k][l]);
+        }
+        for (int k = 0; k < outside->a.rows; k++) {
+            out_tau[k] = V(outside->s.tau[k][l]);
+            out_nu[k] = V(outside->s.nu[k][l]);
+        }
     }
     // every lane starts from the remembered sites, drawn along with its own half-widths
     void recall() {
@@ -127,6 +147,22 @@ struct EpLearner {
         }
         ep.rescale(was);
         if (dirty) ep.forget();
+        dirty = false;
+        if (!outside) return;
+        for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
+            outside->s.m[k] = out_m[k];
+            outside->s.D[k] = out_D[k];
+        }
+        for (int k = 0; k < outside->a.rows; k++) {
+            outside->s.tau[k] = out_tau[k];
+            outside->s.nu[k] = out_nu[k];
+        }
+        outside->rescale(was);
+        outside->forget();
+    }
+    void begin() {
+        ep.start();
+        if (outside) outside->start();
         dirty = false;
     }
     bool dirty = false;  // the message may hold what is not finite
@@ -142,6 +178,24 @@ struct EpLearner {
             value[l] = sound ? f.log_z[l] + log_prior(phi[l], l) : minus_inf;
             for (int j = 0; j < q; j++)
                 slope[l][j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l] + prior_slope(j, phi[l], l);
+        }
+    }
+    // the same with the bounds as a condition; where they alone have no evidence at the start they
+    // are left a factor
+    void evaluate_inside(const double (*phi)[ep_free], int most, double tol, double* value, double (*slope)[ep_free],
+                         bool first) {
+        if (outside) {
+            sweeps += outside->settle(fo, most, max2(tol, a.tol), a.base.damping) + 1;
+            outside->look(fo);
+        }
+        evaluate(phi, most, tol, value, slope);
+        if (outside && first && value[0] > minus_inf && !outside->sound(fo, 0)) outside = nullptr;
+        if (!outside) return;
+        for (int l = 0; l < lanes; l++) {
+            if (!outside->sound(fo, l)) value[l] = minus_inf;
+            value[l] -= a.condition * fo.log_z[l];
+            for (int j = 0; j < q; j++)
+                if (group[j] >= 0) slope[l][j] -= a.condition * fo.slope[group[j]][l];
         }
     }
 
@@ -235,14 +289,13 @@ struct EpLearner {
             }
             for (int l = 0; l < lanes; l++) put(l, at[l]);
             if (k > 0 || warm) recall();
-            else ep.start();
-            evaluate(at, k > 0 || warm ? a.few : a.many, a.tol, value, slope);
+            else begin();
+            evaluate_inside(at, k > 0 || warm ? a.few : a.many, a.tol, value, slope, *best == minus_inf);
             if (!(value[0] > *best - 0.05 * q) && refused < 6) {  // too far, or no trajectory fits
                 refused++;
                 if (*best == minus_inf) {  // the start itself: wider half-widths fit more
                     for (int j = 0; j < q; j++) phi[j] = min2(max2(phi[j] + (group[j] >= 0 ? 0.7 : 0.0), lo[j]), hi[j]);
-                    ep.start();
-                    dirty = false;
+                    begin();
                     remember(0);
                     warm = false;
                     k = -1;
@@ -335,7 +388,10 @@ struct EpLearner {
             phi[j] = min2(max2(start, lo[j]), hi[j]);
         }
         for (int l = 0; l < lanes; l++) {
-            for (int g = 0; g < b.groups; g++) ep.s.s[g].set(l, a.start[g]);
+            for (int g = 0; g < b.groups; g++) {
+                ep.s.s[g].set(l, a.start[g]);
+                if (outside) outside->s.s[g].set(l, a.start[g]);
+            }
             ep.s.eps.set(l, a.rate);
             put(l, phi);
         }
@@ -351,6 +407,10 @@ struct EpLearner {
             }
             for (int g = 0; g < b.groups; g++) was[g] = V(a.was[g]);
             ep.forget();
+            if (outside) {
+                outside->start();
+                remember_outside(0);
+            }
         }
         const EpCross wanted = ep.cross;
         ep.cross = EpCross{};
@@ -364,8 +424,8 @@ struct EpLearner {
         } else {
             double at[lanes][ep_free] = {}, value[lanes], slope[lanes][ep_free];
             if (warm) recall();
-            else ep.start();
-            evaluate(at, a.most, a.tol_nodes, value, slope);
+            else begin();
+            evaluate_inside(at, a.most, a.tol_nodes, value, slope, true);
             if (value[0] == minus_inf) return 2;
             best = value[0];
             if (!(f.residual[0] < a.tol_nodes)) code = 1;
@@ -422,7 +482,7 @@ struct EpLearner {
                 put(l, at[l]);
             }
             recall();
-            evaluate(at, a.most, a.tol_nodes, value, slope);
+            evaluate_inside(at, a.most, a.tol_nodes, value, slope, false);
             ep.shapes(b.k3, b.k4);
             for (int l = 0; l < lanes && k + l < nodes; l++) {
                 for (int j = 0; j < q; j++) {

@@ -1,8 +1,10 @@
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import halfwidth as hw
+from halfwidth.spread import Shaped
 
 
 def test_normal_interval_is_the_two_sided_quantile():
@@ -36,3 +38,35 @@ def test_priors_can_be_drawn_from():
     draws = np.array([hw.Normal([1.0, 0.0], [[1.0, 0.5], [0.5, 2.0]]).sample(rng) for _ in range(4000)])
     np.testing.assert_allclose(np.cov(draws.T), [[1.0, 0.5], [0.5, 2.0]], atol=0.15)
     assert np.all(np.abs(hw.Box([-1, -2], [1, 2]).sample(rng)) <= [1, 2])
+
+
+def test_bent_quantiles_are_those_of_a_beta_law():
+    from scipy.stats import beta
+
+    for a, b in ((1.0, 1.0), (2.0, 2.0), (1.5, 4.0), (30.0, 20.0)):
+        mean, var, skew, kurt = (np.array([[float(v)]]) for v in beta.stats(a, b, moments="mvsk"))
+        for level in (0.5, 0.9, 0.99):
+            lo, hi = Shaped(mean, var[..., None], skew, kurt).interval(level)
+            np.testing.assert_allclose(
+                [lo[0, 0], hi[0, 0]], beta.ppf([0.5 - level / 2, 0.5 + level / 2], a, b), atol=1e-9
+            )
+
+
+def test_bent_quantiles_without_bend_are_gaussian():
+    from statistics import NormalDist
+
+    for skew, kurt in ((0.0, 0.0), (1e-9, -1e-9), (-1e-4, -1e-4), (0.0, 1e-6)):
+        spread = Shaped(np.zeros((1, 1)), np.ones((1, 1, 1)), np.array([[skew]]), np.array([[kurt]]))
+        assert spread.interval(0.9)[1][0, 0] == pytest.approx(NormalDist().inv_cdf(0.95), abs=2e-3)
+
+
+def test_bent_quantiles_nest_and_are_finite_whatever_the_moments():
+    skew, kurt = np.meshgrid(np.linspace(-3, 3, 41), np.linspace(-3, 6, 41))
+    spread = Shaped(np.zeros(skew.shape), np.broadcast_to(np.eye(41), (41, 41, 41)), skew, kurt)
+    last = spread.interval(0.01)
+    for level in (0.3, 0.5, 0.9, 0.999):
+        ends = spread.interval(level)
+        assert np.isfinite(ends).all()
+        assert np.all(ends[0] <= last[0] + 1e-12)
+        assert np.all(ends[1] >= last[1] - 1e-12)
+        last = ends

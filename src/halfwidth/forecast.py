@@ -5,13 +5,11 @@ A record is extended by rows without outputs; whatever estimates the states of a
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from halfwidth.array import Array
 from halfwidth.errors import BadValue
 from halfwidth.estimate import estimate
-from halfwidth.methods.kalman import matrices
+from halfwidth.methods.choose import foretold
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate
@@ -27,7 +25,7 @@ def forecast(
     dt: float | None = None,
     method: Any = None,
 ) -> Estimate:
-    """Estimate the states, and for a linear Gaussian model the outputs, of the rows after a record.
+    """Estimate the states, and for a linear model the outputs, of the rows after a record.
 
     Parameters
     ----------
@@ -46,7 +44,7 @@ def forecast(
     -------
     Estimate
         Of the new rows only; ``info["y"]`` (steps, ny) and ``info["S"]`` (steps, ny, ny) are mean and covariance of
-        their outputs where the spread is Gaussian and the model linear.
+        their outputs where the spread has a covariance and the model is linear.
 
     Raises
     ------
@@ -71,13 +69,9 @@ def forecast(
     est = estimate(model, longer, method)
     s = slice(len(record), len(longer))
     info: dict[str, Any] = {"message": est.message, "n_seen": int(record.seen.sum())}
-    P = est.P
-    if isinstance(model, Linear) and P is not None:
-        t, step = longer.t, longer.steps(model.dt)
-        m = matrices(model, t, step)
-        C, R = (_tail(stack, m.which.get(name), s) for stack, name in ((m.C, "iC"), (m.R, "iR")))
-        info["y"] = (C @ est.x[s][:, :, None])[:, :, 0]
-        info["S"] = C @ P[s] @ np.swapaxes(C, -1, -2) + R
+    if isinstance(model, Linear) and est.P is not None and est.status.good:
+        y, S = foretold(model, est, longer)
+        info |= {"y": y[s], "S": S[s]}
     return Estimate(
         est.t[s],
         est.x[s],
@@ -92,9 +86,3 @@ def forecast(
         labels=longer.labels,
         info=info,
     )
-
-
-def _tail(stack: Array, which: Any, s: slice) -> Array:
-    if which is not None:
-        return np.asarray(stack[which[s]])
-    return np.asarray(stack[0] if len(stack) == 1 else stack[s])

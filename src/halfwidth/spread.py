@@ -339,7 +339,9 @@ def biased_quantile(bias: Array, level: float) -> Array:
 class Shaped:
     """The state has these moments: a Gaussian bent by skewness and kurtosis.
 
-    Quantiles follow from the moments by the expansion of Cornish and Fisher (1938).
+    Quantiles are those of the beta law (Pearson's type I) with the same four moments: between two ends, as bounded
+    noise leaves a state, and flatter than a Gaussian. Tails heavier than those of any beta law follow from the
+    expansion of Cornish and Fisher (1938).
 
     Parameters
     ----------
@@ -377,6 +379,9 @@ class Shaped:
                 q = sign * z
                 bent = q + (q**2 - 1) * a / 6 + (q**3 - 3 * q) * b / 24 - (2 * q**3 - 5 * q) * a**2 / 36
                 lo, hi = np.minimum(lo, bent), np.maximum(hi, bent)
+        tail = 0.5 - 0.5 * level
+        beta = _beta(a, b, tail), _beta(a, b, 1.0 - tail)
+        lo, hi = np.where(np.isnan(beta[0]), lo, beta[0]), np.where(np.isnan(beta[1]), hi, beta[1])
         lo, hi = self.mean + self.sd * lo, self.mean + self.sd * hi
         if self.within is not None:
             lo, hi = np.clip(lo, *self.within), np.clip(hi, *self.within)
@@ -393,6 +398,21 @@ class Shaped:
             np.asarray((share**3 @ self.skew[..., None])[..., 0]),
             np.asarray((share**4 @ self.kurt[..., None])[..., 0]),
         )
+
+
+def _beta(skew: Array, kurt: Array, p: float) -> Array:
+    """Return the standardised p-quantile of the beta law with these cumulants, NaN where there is none."""
+    from scipy.special import betaincinv
+
+    b1, b2 = skew**2, kurt + 3.0
+    left = 6.0 + 3.0 * b1 - 2.0 * b2
+    some = left > 1e-2
+    r = np.maximum(6.0 * (b2 - b1 - 1.0) / np.where(some, left, 1.0), 1e-2)
+    root = np.sign(skew) * (r + 2.0) * np.sqrt(b1 / ((r + 2.0) ** 2 * b1 + 16.0 * (r + 1.0)))
+    # shapes with a peak at an end, not two
+    a, b = np.maximum(0.5 * r * (1.0 - root), 1.0), np.maximum(0.5 * r * (1.0 + root), 1.0)
+    z = (betaincinv(a, b, p) - a / (a + b)) * (a + b) * np.sqrt((a + b + 1.0) / (a * b))
+    return np.asarray(np.where(some, z, np.nan))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,10 +5,15 @@ window i is, about its posterior, a quadratic in u = s^(1/2),
 
     log Z_i(u) ~ pull_i' u - u' H_i u / 2,    H_i = -Cov(g, u) Cov(u)^-1,    pull_i = E g + H_i E u,
 
-where g is the slope of log Z_i and the moments are those of the posterior over u (the nodes of `Posterior`). A row lies in as
-many windows as a window has rows, N: each window counts 1 / N, and only once **all** of its rows have left, so no row
-speaks twice and the prior of the newest window holds none of its own data. The sum of overlapping window likelihoods is a composite
-likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by exp(-1 / rows) a row.
+where g is the slope of log Z_i and the moments are those of the posterior over u (the nodes of `Posterior`). A row lies
+in as many windows as a window has rows, N: each window counts 1 / N, and only once **all** of its rows have left, so no
+row speaks twice and the prior of the newest window holds none of its own data. The sum of overlapping window
+likelihoods is a composite likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by
+exp(-1 / rows) a row.
+
+Bounds are a condition on what is carried: as a mere factor of the evidence they count as an event that small
+half-widths make likely, and over many windows that adds up. A quadratic of log P(inside | u), the evidence of the
+chain with its bounds alone, is taken off for every N-th window, N times as heavy.
 
 The state before the first row of a window is what the sites of the rows that have left make of it: the forwards message
 of expectation propagation, a Gaussian.
@@ -24,6 +29,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.methods._sites import Sites
 from halfwidth.spread import Normal
@@ -33,6 +39,8 @@ if TYPE_CHECKING:
 
 #: Power of a half-width in which its posterior is nearly Gaussian: 0 is no tail there.
 WARP = 0.5
+#: Sweeps of the chain with its bounds alone, and the log share of a cavity inside a bound from which it is believed.
+_SWEEPS, _WORST = 50, -60.0
 
 
 class Known(NamedTuple):
@@ -112,8 +120,31 @@ def told(answer: "Answer") -> Known:
     return known
 
 
+def inside(chain: Sites, s: Array) -> Known:
+    """Return the logarithm of the evidence of the bounds alone, to second order about half-widths s (p,)."""
+    known, problem = Known.none(len(s)), chain.outside
+    free = np.flatnonzero(chain.free)
+    if problem is None or not free.size:
+        return known
+    h = 0.02
+    steps = np.exp(h * np.eye(len(s))[free])
+    members = np.concatenate([s[None], s * steps, s / steps])
+    found = _core.ep_run(problem, members, np.zeros(len(members)), _SWEEPS, 1e-4, 1.0, None)
+    g = found["slope"][:, free]
+    q = free.size
+    column = (g[1 : q + 1] - g[q + 1 :]) / (2.0 * h)
+    if not (np.isfinite(found["log_z"]).all() and np.isfinite(column).all() and (found["worst"] > _WORST).all()):
+        return known
+    u = s[free] ** WARP
+    slope = g[0] / (WARP * u)
+    H = -(0.5 * (column + column.T) - np.diag(WARP * g[0])) / (WARP**2 * u[:, None] * u)
+    known.precision[np.ix_(free, free)] = H
+    known.pull[free] = slope + H @ u
+    return known
+
+
 def messages(chain: Sites, sites: tuple[Array, ...], stages: int) -> list[tuple[Array, Array]]:
-    """Return mean and covariance of x_0 .. x_stages given what lies up to each alone, by the sites of a solved chain."""
+    """Return mean and covariance of x_0 .. x_stages, each given what lies up to it, by the sites of a solved chain."""
     p = chain.problem
     n = len(p["m0"])
     m, D = (np.asarray(v).reshape(-1, n) for v in sites[:2])
@@ -167,6 +198,7 @@ class Carried:
         self.gone = Known.none(p)
         self.waiting: list[tuple[int, Known]] = []  # newest row of a window, and what it told, weighted
         self.s: Array | None = None
+        self.count = 0  # windows that told something
         self.first: Normal | None = None  # the state before the first row, once rows have left
         self._edge: list[tuple[Array, Array]] | None = None  # messages of the newest window's stages ...
         self._newest: Answer | None = None  # ... or what they are made of
@@ -199,8 +231,13 @@ class Carried:
         if not answer.estimate.status.good:
             return
         self.s, self._newest = answer.start.s, answer
-        if counts:
-            self.waiting.append((newest, Known.none(len(self.s)).plus(told(answer), 1.0 / rows)))
+        if not counts:
+            return
+        known = Known.none(len(self.s)).plus(told(answer), 1.0 / rows)
+        if self.count % rows == 0:
+            known = known.plus(inside(answer.chain, self.s), -1.0)
+        self.count += 1
+        self.waiting.append((newest, known))
 
     def save(self) -> dict[str, Any]:
         """Return all of it as plain numbers."""
@@ -211,6 +248,7 @@ class Carried:
         return {
             "gone": [v.tolist() for v in self.gone],
             "waiting": [[k, known.pull.tolist(), known.precision.tolist()] for k, known in self.waiting],
+            "count": self.count,
             "s": None if self.s is None else self.s.tolist(),
             "first": None if self.first is None else [self.first.mean.tolist(), self.first.P.tolist()],
             "edge": None if edge is None else [[x.tolist(), P.tolist()] for x, P in edge],
@@ -222,6 +260,7 @@ class Carried:
         self.waiting = [
             (int(k), Known(np.array(h, dtype=float), np.array(H, dtype=float))) for k, h, H in saved["waiting"]
         ]
+        self.count = int(saved["count"])
         self.s = None if saved["s"] is None else np.array(saved["s"], dtype=float)
         first, edge = saved["first"], saved["edge"]
         self.first = None if first is None else Normal(*first)

@@ -55,6 +55,16 @@ class Sites:
     output: NDArray[np.intp]
 
     @property
+    def outside(self) -> dict[str, Any] | None:
+        """The chain with its bounds alone, None where there are none; see core/ep_learn.hpp."""
+        p, keep = self.problem, self.problem["kind"] == TRUNCATION
+        if not keep.any():
+            return None
+        rows = {k: np.ascontiguousarray(p[k][keep]) for k in ("h", "y", "kind", "group", "R", "lo", "hi")}
+        before = np.concatenate([[0], np.cumsum(keep)])
+        return p | rows | {"lost": None, "mix": None, "start": before[p["start"]].astype(np.int32)}
+
+    @property
     def exact(self) -> bool:
         """Whether every factor is Gaussian, so that one sweep is the answer."""
         kind = self.problem["kind"]

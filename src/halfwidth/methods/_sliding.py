@@ -52,7 +52,7 @@ TOL = 1e-8
 
 
 class Solved(NamedTuple):
-    """One window: states (rows + 1, nx), theta, half-widths (nx + ny,), how it went, and the newest state's spread."""
+    """One window: states (rows + 1, nx), theta, half-widths (nx + ny,), how it went, and the spread of its rows."""
 
     x: Array
     theta: Array
@@ -174,6 +174,10 @@ class Sliding:
         self._forget(a, seen)
         return solved
 
+    def back(self) -> int:
+        """Return how many rows ago the state is that is asked for: `lag`, or that of the first row."""
+        return min(self.window.lag, self.pushed - 1)
+
     def _note(self, k: int, x: Array, last: NDArray[np.int32]) -> None:
         self.x[k] = x
         if k == len(self.low):
@@ -221,17 +225,20 @@ class Sliding:
                 return solved
         est = method.run(model, part, seed=self.seed) if self.carried is None else self._posterior(model, part, a)
         s = np.full(model.nx + model.ny, np.nan) if est.q is None or est.r is None else np.r_[est.q, est.r]
-        info = {k: v for k, v in est.info.items() if k in ("solver", "objective", "notes", "message", "gap")}
+        info = {
+            k: v for k, v in est.info.items() if k in ("solver", "objective", "notes", "message", "gap", "half_widths")
+        }
         return Solved(
             np.vstack([est.info.get("x0", self.x[a]), est.x]), np.zeros(0) if est.theta is None else est.theta, s,
-            est.status, int(est.info.get("iterations", 0) or 0), info, rows_of_spread(est.spread, slice(-1, None)),
+            est.status, int(est.info.get("iterations", 0) or 0), info, est.spread,
         )  # fmt: skip
 
     def _posterior(self, model: Model, part: Record, a: int) -> Estimate:
         """Estimate one window with what the rows before it told."""
         held, method = self.carried, self.window.method
-        assert held is not None and isinstance(method, Posterior)
-        seen = part.seen.any(axis=1)
+        assert held is not None
+        assert isinstance(method, Posterior)
+        seen = np.atleast_1d(part.seen.any(axis=1))
         answer = method.resumed(model, part, held.s, held.known(self.first + a))
         newest = self.first + len(self.times) - 1
         rows = max(int(seen.sum()), self.window.memory + 1)
@@ -402,10 +409,12 @@ class Live:
         solved = held.push(*pushed_row(model, y, u, dt))
         low, high, windows = held.ahead.bounds()
         good, nx = solved.status.good and np.isfinite(solved.s).all(), model.nx
+        back = held.back()
+        ago = slice(-1 - back, -back or None)
         return Estimate(
-            np.array([held.t]),
-            held.x[-1][None].copy(),
-            solved.spread,
+            np.array(held.times[ago]),
+            held.x[-1 - back][None].copy(),
+            None if solved.spread is None else rows_of_spread(solved.spread, ago),
             solved.status,
             self.method,
             q=solved.s[:nx].copy() if good else None,

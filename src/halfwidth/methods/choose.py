@@ -13,8 +13,9 @@ import numpy as np
 from halfwidth.array import Array, generator
 from halfwidth.errors import BadValue
 from halfwidth.methods._protocol import Estimator
+from halfwidth.methods._sites import gaussian_part, uniform_part
+from halfwidth.methods.sequential import filled
 from halfwidth.model import Linear
-from halfwidth.noise import Gaussian, Mixed, Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 
@@ -118,9 +119,9 @@ def compare(
             est = method.run(model, part, seed=seed)
             if not est.status.good or est.P is None or not mask.any():
                 continue
-            mean, var = _foretold(model, est, part)
+            mean, S = foretold(model, est, part)
             d = (record.y - mean)[mask]
-            v = var[mask]
+            v = np.diagonal(S, axis1=1, axis2=2)[mask]
             log_p.append(-0.5 * (np.log(2 * np.pi * v) + d**2 / v))
             off.append(np.abs(d) / np.broadcast_to(unit, mask.shape)[mask])
         score.append(float(np.mean(np.concatenate(log_p))) if log_p else math.nan)
@@ -134,16 +135,20 @@ def _top(values: Array) -> int:
     return int(np.argmax(np.where(np.isnan(values), -np.inf, values)))
 
 
-def _foretold(model: Linear, est: Estimate, record: Record) -> tuple[Array, Array]:
-    """Return mean and variance (T, ny) of every output, seen or not, as Gaussians."""
+def foretold(model: Linear, est: Estimate, record: Record) -> tuple[Array, Array]:
+    """Return mean (T, ny) and covariance (T, ny, ny) of every output, seen or not.
+
+    The half-widths of the output noise count as variances r^2 / 3, unknown ones and unknown entries as estimated.
+    """
+    if model.theta_entries and est.theta is not None:
+        model = filled(model, est.theta)
     dt = record.steps(model.dt)
     stack, index = model.C.stack(record.t, dt)
     C = np.broadcast_to(stack, (len(record), *stack.shape[1:])) if index is None else stack[index]
     R = np.zeros((len(record), model.ny, model.ny))
-    if isinstance(model.e, Uniform | Mixed):
-        r = np.asarray(est.r)
-        R = R + np.diag(r**2 / 3.0)
-    part = model.e if isinstance(model.e, Gaussian) else model.e.gaussian if isinstance(model.e, Mixed) else None
+    box, part = uniform_part(model.e), gaussian_part(model.e)
+    if box is not None:
+        R = R + np.diag((box.q if box.known else np.asarray(est.r)) ** 2 / 3.0)
     if part is not None:
         own, which = part.cov().stack(record.t, dt)
         R = R + (own if which is None else own[which])
@@ -154,4 +159,4 @@ def _foretold(model: Linear, est: Estimate, record: Record) -> tuple[Array, Arra
         back = np.linalg.inv(own if which is None else own[which])
         mean = np.einsum("tij,tj->ti", np.broadcast_to(back, var.shape), mean)
         var = back @ var @ np.swapaxes(back, -1, -2)
-    return mean, np.diagonal(var, axis1=1, axis2=2)
+    return mean, var

@@ -7,6 +7,8 @@ smoother passes. Its evidence log Z finds what is unknown:
 
     p(s | y) ~ Z(s) p(s),    p(log s) = s^power told(s),    told^2 = mean (1 - posterior / prior variance of a row)^2
 
+Staying inside `bounds` is an event that small half-widths make likely: over many rows it would shrink them. So beyond
+26 rows bounds are a condition: Z is divided by the evidence that the bounds alone have (core/ep_learn.hpp).
 The prior has no scale: where a noise drowns in the others told ~ s^2 and the prior falls to 0, where it is seen told
 is 1 and the prior is a power. `power` is what a study of coverage gave in windows of 6, 26 and 51
 rows (benchmarks/posterior.py).
@@ -47,6 +49,9 @@ _LIMITS = {
     "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.25, "least": 0.3,
     "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
 }  # fmt: skip
+#: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone
+#: shape the path. In longer records bounds are a condition in the others.
+_EVENT = 26
 #: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
 #: with them; there is less left to integrate.
 _LONG = 2000
@@ -95,8 +100,9 @@ class Posterior:
 
     ``q``, ``r`` are posterior means. ``loglik`` is the logarithm of the evidence, half-widths integrated out under a
     prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
-    count as a factor, not as a condition. In ``info``: ``x0``; ``half_widths``, a mapping with ``mean``, ``sd``, ``lo``
-    and ``hi`` (5 and 95 %) of (q, r); ``outliers``, the named outputs with a probability above one half; ``residual``,
+    count as a factor in 26 rows and as a condition in the others. In ``info``: ``x0``; ``half_widths``, a mapping
+    with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %) of (q, r); ``outliers``, the named outputs with a
+    probability above one half; ``residual``,
     the disagreement of moments in standard deviations, the largest of each node; ``sweeps``; ``nodes`` and their
     ``effective`` number.
 
@@ -252,6 +258,7 @@ class Posterior:
         q = int(chain.free.sum()) + learn_rate
         z, log_proposal = nodes(q, self.nodes if q else 1)
         limits = dict(_LIMITS)
+        limits["condition"] = max(0.0, 1.0 - _EVENT / max(len(chain.problem["start"]) - 2, 1))
         rows = max(float(chain.count.sum()), 1.0)
         limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
         limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
@@ -268,7 +275,7 @@ class Posterior:
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
                 learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z, log_proposal,
                 limits, sites_, was, None if known is None else known.pull,
-                None if known is None else known.precision,
+                None if known is None else known.precision, chain.outside if limits["condition"] > 0 else None,
             )
         )  # fmt: skip
 

@@ -55,7 +55,7 @@ from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.solvers.banded import POINTS, STATUSES, Chain, chain_of, solve
-from halfwidth.spread import Box, Spread
+from halfwidth.spread import Box, Spread, part
 
 
 @dataclass(frozen=True)
@@ -78,12 +78,16 @@ class Window:
     recall : float
         For ``Posterior``: what rows that have left the window told of half-widths and of the state at its edge is
         carried on; of half-widths it fades over `recall` times memory + 1 rows. 0 takes every window on its own.
+    lag : int
+        Row t uses the outputs up to row t + lag, at most `memory`: each push of a stream gives the estimate of `lag`
+        rows ago.
 
     Notes
     -----
-    ``x[k]`` is the newest state of the window that ends at row k. In ``info``: ``smoothed`` (T, nx), the last
-    estimate of each state; ``low``, ``high`` and ``windows``, what `ensemble_interval` needs; ``q``, ``r``, ``theta``
-    of every window; ``start``, ``extrapolated``, ``since_fix``, ``statuses``, ``iterations`` and, of ``BatchLP``,
+    ``x[k]`` is the state of row k in the window that ends at row k + `lag`, or at the last one. In ``info``:
+    ``smoothed`` (T, nx), the last estimate of each state; ``low``, ``high`` and ``windows``, what `ensemble_interval`
+    needs; ``q``, ``r``, ``theta`` of every window; ``start``, ``extrapolated``, ``since_fix``, ``statuses``,
+    ``iterations`` and, of ``BatchLP``,
     ``seconds`` of CPU time of every row; ``newest_low``, ``newest_high``, ``newest_windows``, what
     ``ensemble_interval(newest=True)`` needs. Those of the estimate itself are the last window's; its status is
     the worst of all windows.
@@ -109,6 +113,7 @@ class Window:
     fixes: int = 10
     stretch: int | None = None
     recall: float = 40.0
+    lag: int = 0
 
     def __post_init__(self) -> None:
         if isinstance(self.method, type) or not isinstance(self.method, Estimator) or isinstance(self.method, Window):
@@ -119,6 +124,8 @@ class Window:
             raise BadValue(f"`carry` is {self.carry!r}, a positive number or None was expected")
         if self.fixes < 0:
             raise BadValue(f"`fixes` is {self.fixes!r}, 0 or more was expected")
+        if not isinstance(self.lag, int | np.integer) or not 0 <= self.lag <= self.memory:
+            raise BadValue(f"`lag` is {self.lag!r}, a whole number of rows up to memory = {self.memory} was expected")
         if not 0 <= self.recall < math.inf:
             raise BadValue(f"`recall` is {self.recall!r}, a number of windows from 0 was expected")
         if self.stretch is not None and self.stretch < self.memory + 1:
@@ -133,7 +140,7 @@ class Window:
         """Estimate the newest state at every row."""
         start = window_starts(record.seen, self.memory, fixes=self.fixes, stretch=self.stretch)
         found = None
-        if isinstance(model, Linear) and isinstance(self.method, BatchLP):
+        if isinstance(model, Linear) and isinstance(self.method, BatchLP) and not self.lag:
             found = self._batch(model, record, start)
         return self._estimate(model, record, start, self._each(model, record, seed) if found is None else found)
 
@@ -194,14 +201,19 @@ class Window:
         found = _Found.empty(T, nx, nx + model.ny, len(getattr(model, "theta_entries", ())))
         for t in range(T):
             solved = rows.push(record.y[t], None if record.u is None else record.u[t], float(dt[t]))
-            found.filtered[t], found.s[t], found.statuses[t] = rows.x[-1], solved.s, solved.status
+            back = rows.back()
+            done = slice(t - back, t + 1 if t == T - 1 else t - back + 1)  # the last window has nothing to wait for
+            of_window = slice(done.start - t - 1, done.stop - t - 1 or None)
+            found.filtered[done] = np.array(rows.x)[of_window]
+            found.s[t], found.statuses[t] = solved.s, solved.status
             found.iterations[t] = solved.iterations
             if found.theta is not None and found.theta.shape[1] == solved.theta.size:
                 found.theta[t] = solved.theta
             found.newest_low[t], found.newest_high[t], found.newest_windows[t] = rows.ahead.bounds()
             held = slice(rows.first, t + 2)
             found.smoothed[held], found.low[held], found.high[held] = rows.x, rows.low, rows.high
-            found.spreads.append(solved.spread)
+            if t >= self.lag or t == T - 1:
+                found.spreads.append(None if solved.spread is None else part(solved.spread, of_window))
         return found
 
     def _estimate(self, model: Model, record: Record, start: NDArray[np.int32], found: "_Found") -> Estimate:
@@ -239,7 +251,7 @@ class Window:
             info["message"] = f"{worst.value}: {len(unsolved)} of {T} windows, the first at row {unsolved[0]}"
         if np.any(since > 0) and "message" not in info:
             info["message"] = f"{worst.value}; {int(np.count_nonzero(since > 0))} rows extrapolate beyond the last fix"
-        spread = stacked(found.spreads) if len(found.spreads) == T else None
+        spread = stacked(found.spreads) if found.spreads else None
         theta = found.theta[-1] if found.theta is not None and found.theta.shape[1] else None
         s = found.s[-1]
         known = np.isfinite(s).all() and found.statuses[-1].good

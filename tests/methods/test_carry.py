@@ -1,0 +1,249 @@
+"""What `Window(Posterior())` hands on when rows leave: the state at its edge, and what is known of half-widths."""
+
+import numpy as np
+import pytest
+
+import halfwidth as hw
+from halfwidth.methods._carry import Carried, Known, inside, messages, told
+from halfwidth.methods._sites import sites
+
+A = np.array([[1, -0.5, 0.2], [0.5, 0.1, 0], [0.3, 0, -0.1]])
+C = np.array([[1, 0, 0.5], [0, 1, 0.5]])
+UNKNOWN = hw.Uniform.unknown(at_most=3.0)
+BOX = hw.Box(-2 * np.ones(3), 2 * np.ones(3))
+TRUE = np.array([0.1, 0.1, 0.1, 0.3, 0.3])
+
+
+def system(w, e, x0=BOX, **more):
+    return hw.Linear(A, None, C, w, e, x0, **more)
+
+
+def drawn(T, seed):
+    return hw.simulate(
+        system(hw.Uniform(0.1), hw.Uniform(0.3), hw.Box(-0.1 * np.ones(3), 0.1 * np.ones(3))), T=T, seed=seed
+    )
+
+
+def test_a_gaussian_window_with_its_edge_is_the_kalman_filter():
+    model = system(hw.Gaussian(0.01), hw.Gaussian(0.03), hw.Normal(np.zeros(3), 1.0))
+    _, record = drawn(40, 1)
+    y = record.y.copy()
+    y[7:12] = y[20, 0] = np.nan
+    record = hw.Record(record.t, y)
+    whole = hw.estimate(model, record, hw.KalmanFilter())
+    window = hw.estimate(model, record, hw.Window(hw.Posterior(), memory=4, fixes=0))
+    np.testing.assert_allclose(window.x, whole.x, atol=1e-9)
+    np.testing.assert_allclose(window.P, whole.P, atol=1e-9)
+
+
+def test_messages_with_matrices_that_vary_and_correlate():
+    rng = np.random.default_rng(2)
+    E = np.array([[1, 0.3, 0.1], [0, 1, 0.2], [0, 0, 1]])
+    _, record = drawn(12, 3)
+    model = hw.Linear(
+        A + 0.05 * rng.standard_normal((12, 3, 3)), None, C, hw.Gaussian(0.01), hw.Gaussian(0.03),
+        hw.Normal(np.zeros(3), 1.0), E=E,
+    )  # fmt: skip
+    answer = hw.Posterior().answer(model, record)
+    found = messages(answer.chain, answer.found["sites"], 12)
+    kf = hw.estimate(model, record, hw.KalmanFilter())
+    np.testing.assert_allclose([x for x, _ in found[1:]], kf.x, atol=1e-9)
+    np.testing.assert_allclose([P for _, P in found[1:]], kf.P, atol=1e-9)
+
+
+def test_what_a_window_tells_is_the_slope_of_its_evidence():
+    _, record = drawn(400, 4)
+    answer = hw.Posterior().answer(system(UNKNOWN, UNKNOWN), record)
+    known = told(answer)
+    chain = sites(system(UNKNOWN, UNKNOWN), record)
+    s = answer.start.s
+
+    def evidence(s):
+        import halfwidth._core as _core
+
+        return _core.ep_run(chain.problem, s[None].copy(), np.zeros(1), 200, 1e-8, 1.0, None)["log_z"][0]
+
+    at = np.sqrt(s)
+    for direction in np.eye(5):
+        h = 0.03 * at * direction
+        slope = (evidence((at + h) ** 2) - evidence((at - h) ** 2)) / 2
+        ours = known.pull @ h - h @ known.precision @ at
+        assert ours == pytest.approx(slope, abs=0.2)
+
+
+def test_knowing_half_of_the_rows_is_as_good_as_having_them():
+    _, record = drawn(240, 5)
+    first, second = (hw.Record(record.t[k], record.y[k]) for k in (slice(0, 120), slice(120, 240)))
+    model = system(UNKNOWN, UNKNOWN)
+    known = told(hw.Posterior().answer(model, first))
+    answer = hw.Posterior().answer(model, second, known=known)
+    both, alone = (hw.estimate(model, r, hw.Posterior()).info["half_widths"] for r in (record, second))
+    carried = answer.estimate.info["half_widths"]
+    assert np.all(carried["sd"] < alone["sd"] * 0.95)
+    np.testing.assert_allclose(carried["sd"], both["sd"], rtol=0.25)
+    np.testing.assert_array_less(np.abs(carried["mean"] - both["mean"]), 0.5 * both["sd"])
+
+
+def test_a_stream_knows_what_the_batch_knows():
+    _, record = drawn(150, 2)
+    model = system(UNKNOWN, UNKNOWN)
+    live, alone, brief = (
+        hw.stream(model, hw.Window(hw.Posterior(nodes=16), memory=12, recall=recall)) for recall in (40.0, 0.0, 0.5)
+    )
+    for k, y in enumerate(record.y):
+        newest = live.push(y)
+        if k >= 100:
+            other, faded = alone.push(y), brief.push(y)
+    batch = hw.estimate(model, record, hw.Posterior()).info["half_widths"]
+    widths, single, short = (e.info["half_widths"] for e in (newest, other, faded))
+    np.testing.assert_array_less(np.abs(widths["mean"] - batch["mean"]), 2 * batch["sd"])
+    np.testing.assert_allclose(widths["sd"], batch["sd"], rtol=1.0)
+    rough = [np.mean(w["sd"] / w["mean"]) for w in (widths, short, single)]
+    assert rough[0] < 0.8 * rough[1]
+    assert rough[0] < 0.6 * rough[2]
+
+
+def test_no_row_speaks_twice():
+    carried = Carried(1, 1e12)
+    one = Known(np.ones(1), np.ones((1, 1)))
+    for newest in range(40):  # windows of 10 rows, each telling 1 in all
+        known = carried.known(newest - 9)
+        gone = max(newest - 9, 0)
+        assert (0.0 if known is None else known.precision[0, 0]) <= gone / 10 + 1e-9
+        carried.waiting.append((newest, Known.none(1).plus(one, 0.1)))
+    assert carried.gone.precision[0, 0] == pytest.approx(3.0)
+
+
+def test_of_marginalises_and_keeps_what_is_proper():
+    H = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, -1.0]])
+    known = Known(np.array([1.0, 2.0, 3.0]), H)
+    part = known.of(np.array([True, False, True]))
+    assert part.precision[0, 0] == pytest.approx(4 - 1 / 2)
+    assert part.pull[0] == pytest.approx(1 - 2 / 2)
+    assert part.precision[2, 2] == part.pull[2] == 0.0
+
+
+def test_a_snapshot_holds_what_is_carried():
+    _, record = drawn(60, 7)
+    model = system(UNKNOWN, UNKNOWN)
+    live = hw.stream(model, hw.Window(hw.Posterior(nodes=8), memory=6))
+    for y in record.y[:40]:
+        live.push(y)
+    again = hw.resume(live.snapshot(), model)
+    for y in record.y[40:45]:
+        one, two = live.push(y), again.push(y)
+        np.testing.assert_allclose(two.x, one.x, atol=1e-9)
+        np.testing.assert_allclose(two.q, one.q, rtol=1e-9)
+
+
+def test_rows_that_fit_nothing_do_not_poison_what_is_known():
+    _, record = drawn(80, 8)
+    y = record.y.copy()
+    y[30] = 1e6
+    capped = system(hw.Uniform.unknown(at_most=1.0), hw.Uniform.unknown(at_most=1.0))
+    est = hw.estimate(capped, hw.Record(record.t, y), hw.Window(hw.Posterior(nodes=8), memory=8))
+    good = np.array([s.good for s in est.info["statuses"]])
+    assert not good[30]
+    assert good[-1]
+    assert np.isfinite(est.x).all()
+    y[30] = np.nan
+    other = hw.estimate(capped, hw.Record(record.t, y), hw.Window(hw.Posterior(nodes=8), memory=8))
+    np.testing.assert_allclose(np.r_[est.q, est.r], np.r_[other.q, other.r], atol=0.15)
+
+
+@pytest.mark.parametrize("recall", [-1.0, np.inf, np.nan])
+def test_bad_settings(recall):
+    with pytest.raises(hw.errors.BadValue, match="recall"):
+        hw.Window(hw.Posterior(), recall=recall)
+
+
+@pytest.mark.parametrize("method", [hw.Posterior(nodes=8), hw.BatchLP()])
+@pytest.mark.parametrize("T", [3, 12])
+def test_a_lag_gives_what_later_rows_tell(method, T):
+    _, record = drawn(T, 9)
+    model = system(UNKNOWN, UNKNOWN)
+    window = hw.Window(method, memory=6, lag=4)
+    est = hw.estimate(model, record, window)
+    assert est.x.shape == (T, 3)
+    live = hw.stream(model, window)
+    for t in range(T):
+        newest = live.push(record.y[t])
+        back = max(t - 4, 0)
+        assert newest.t[0] == record.t[back] if t >= 4 else record.t[0]
+        if t >= 4 or t == T - 1:
+            np.testing.assert_allclose(newest.x[0], est.x[back], atol=1e-9)
+            if est.spread is not None:
+                np.testing.assert_allclose(newest.interval(0.5)[0][0], est.interval(0.5)[0][back], atol=1e-9)
+    ends = hw.estimate(model, record, hw.Window(method, memory=6))
+    np.testing.assert_allclose(ends.x[-1], est.x[-1], atol=1e-9)
+
+
+def test_a_gaussian_lag_is_the_smoother_with_that_lag():
+    model = system(hw.Gaussian(0.01), hw.Gaussian(0.03), hw.Normal(np.zeros(3), 1.0))
+    _, record = drawn(40, 1)
+    whole = hw.estimate(model, record, hw.KalmanSmoother(lag=3))
+    window = hw.estimate(model, record, hw.Window(hw.Posterior(), memory=5, fixes=0, lag=3))
+    np.testing.assert_allclose(window.x, whole.x, atol=1e-9)
+    np.testing.assert_allclose(window.P, whole.P, atol=1e-9)
+
+
+NARROW = hw.Box([-0.8, -0.61, -0.4], [0.76, 0.66, 0.44])
+
+
+def confined(T, seed, many=3000):
+    """Return a record of a path of those that stay inside `NARROW`, from the genealogy of particles."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-0.3, 0.3, (many, 3))
+    X, parent = [x], []
+    for _ in range(T):
+        x = x @ A.T + rng.uniform(-0.3, 0.3, (many, 3))
+        alive = np.flatnonzero(NARROW.contains(x))
+        parent.append(alive[rng.integers(len(alive), size=many)])
+        x = x[parent[-1]]
+        X.append(x)
+    k, path = 0, []
+    for t in range(T, 0, -1):
+        path.append(X[t][k])
+        k = parent[t - 1][k]
+    return hw.Record(np.arange(1.0, T + 1), np.array(path[::-1]) @ C.T + rng.uniform(-0.3, 0.3, (T, 2)))
+
+
+def test_bounds_do_not_shrink_half_widths():
+    model = system(hw.Uniform.unknown(at_most=2.0), hw.Uniform(0.3), NARROW, bounds=NARROW)
+    found = np.array([hw.estimate(model, confined(300, seed), hw.Posterior(nodes=16)).q for seed in range(4)])
+    assert found[:, :2].mean() == pytest.approx(0.3, rel=0.12)
+
+
+def test_the_evidence_of_bounds_alone():
+    model = system(hw.Uniform.unknown(at_most=2.0), hw.Uniform(0.3), NARROW, bounds=NARROW)
+    record = hw.Record(np.arange(1.0, 4.0), np.zeros((3, 2)))
+    chain = sites(model, record)
+    s = np.array([0.3, 0.3, 0.3, 0.3, 0.3])
+    known = inside(chain, s)
+
+    def share(s):  # of paths that stay inside, by the same draws
+        rng = np.random.default_rng(1)
+        x, kept = rng.uniform(NARROW.lo, NARROW.hi, (200_000, 3)), np.ones(200_000, dtype=bool)
+        for _ in range(3):
+            x = x @ A.T + s[:3] * rng.uniform(-1, 1, x.shape)
+            kept &= NARROW.contains(x)
+        return np.log(kept.mean())
+
+    for j in range(3):
+        more, less = s.copy(), s.copy()
+        more[j], less[j] = 0.36, 0.25
+        ours = [known.pull @ np.sqrt(v) - 0.5 * np.sqrt(v) @ known.precision @ np.sqrt(v) for v in (more, less)]
+        assert ours[0] - ours[1] == pytest.approx(share(more) - share(less), abs=0.05)
+    assert inside(sites(system(UNKNOWN, UNKNOWN), record), s).precision.any() == np.False_
+
+
+def test_a_forecast_has_outputs():
+    _, record = drawn(60, 3)
+    F = np.array([[1, 0.4], [0, 1]])
+    for e in (UNKNOWN, hw.Uniform(0.3) + hw.Gaussian(0.01)):
+        model = hw.Linear(A, None, C, hw.Uniform(0.1), e, BOX, F=F)
+        ahead = hw.forecast(model, record, 3, method=hw.Posterior())
+        back = np.linalg.inv(F)
+        R = np.diag(np.asarray(ahead.r) ** 2 / 3 + (0.01 if e is not UNKNOWN else 0.0))
+        np.testing.assert_allclose(ahead.info["y"], ahead.x @ (back @ C).T)
+        np.testing.assert_allclose(ahead.info["S"][2], back @ (C @ ahead.P[2] @ C.T + R) @ back.T)
