@@ -5,8 +5,8 @@ Three answers, each by linear programs over the rows whose half-widths are bound
 - the **inflation**: the least common factor on the half-widths with which a trajectory fits,
 - the **conflicts**: the rows that exceed their bounds when the total excess, in units of sigma, is least,
 - the **contradiction**: rows that alone, with the boxes of the states, cannot be kept, none of which can be left out.
-  The multipliers of the least excess prove such a set; every row is then left out in turn, and for good where the rest
-  still contradicts itself.
+  The multipliers of the least excess prove such a set; bisection finds one place of it, and there every row is left out
+  in turn, and for good where the rest still contradicts itself.
 
 References
 ----------
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from halfwidth.array import Array
 from halfwidth.model import Linear
 from halfwidth.record import Record
-from halfwidth.solvers.lp import HIGHS, Program, Solution, Solver, solve
+from halfwidth.solvers.lp import HIGHS, Program, Solution, Solver, Verdict, solve
 
 if TYPE_CHECKING:
     from halfwidth.methods.map import Task
@@ -70,18 +70,20 @@ def inflation(task: "Task", solvers: Sequence[Solver], grow: NDArray[np.bool_]) 
 
 
 def elastic(
-    task: "Task", solvers: Sequence[Solver], model: Linear, record: Record
+    task: "Task", solvers: Sequence[Solver], model: Linear, record: Record, contradiction: bool
 ) -> tuple[Array | None, list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return the trajectory of least total excess, the rows that exceed there, and rows that contradict each other."""
+    """Return the trajectory of least total excess, the rows that exceed there, and rows that contradict each other.
+
+    The last are sought only if asked for: that takes many programs.
+    """
     rows = _bounded(task)
-    found = _least_excess(task, rows, solvers)
+    found = solve(_excess(task, rows), solvers)
     if not found.solved or found.x is None:
         return None, [], []
     excess = np.zeros(task.rho.size)
     excess[rows] = found.x[task.M.shape[1] :]
-    core = _irreducible(task, _proof(rows, found))
-    contradiction = [_named(task, int(k), model, record) for k in core]
-    return task.point(found.x), named(task, excess, model, record), contradiction
+    core = _irreducible(task, _proof(rows, found)) if contradiction else ()
+    return task.point(found.x), named(task, excess, model, record), [_named(task, int(k), model, record) for k in core]
 
 
 def named(task: "Task", excess: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
@@ -96,8 +98,8 @@ def _bounded(task: "Task") -> NDArray[np.intp]:
     return np.flatnonzero(np.asarray(task.S @ np.isinf(limit).astype(float)) == 0)
 
 
-def _least_excess(task: "Task", rows: NDArray[np.intp], solvers: Sequence[Solver]) -> Solution:
-    """Minimise the total excess of some rows over their caps, in units of sigma: its program's solution."""
+def _excess(task: "Task", rows: NDArray[np.intp]) -> Program:
+    """Return the program of the least total excess of some rows over their caps, in units of sigma."""
     import scipy.sparse as sp
 
     limit = np.where(task.free, task.highest, task.lowest)
@@ -105,17 +107,14 @@ def _least_excess(task: "Task", rows: NDArray[np.intp], solvers: Sequence[Solver
     M, rho = task.M[rows], task.rho[rows]
     wide = task.S[rows] @ np.where(np.isfinite(limit), limit, 0.0)
     unit, none = sp.eye_array(k), np.full(k, np.inf)
-    return solve(
-        Program(
-            c=np.r_[np.zeros(n), np.ones(k)],
-            G=sp.csr_array(sp.vstack([sp.hstack([M, unit]), sp.hstack([M, -unit])])),
-            row_lo=np.r_[-wide - rho, -none],
-            row_hi=np.r_[none, wide - rho],
-            lo=np.r_[task.lo, np.zeros(k)],
-            hi=np.r_[task.hi, none],
-            floor=1e-3,
-        ),
-        solvers,
+    return Program(
+        c=np.r_[np.zeros(n), np.ones(k)],
+        G=sp.csr_array(sp.vstack([sp.hstack([M, unit]), sp.hstack([M, -unit])])),
+        row_lo=np.r_[-wide - rho, -none],
+        row_hi=np.r_[none, wide - rho],
+        lo=np.r_[task.lo, np.zeros(k)],
+        hi=np.r_[task.hi, none],
+        floor=1e-3,
     )
 
 
@@ -129,12 +128,25 @@ def _proof(rows: NDArray[np.intp], found: Solution) -> NDArray[np.intp]:
 
 def _irreducible(task: "Task", rows: NDArray[np.intp]) -> NDArray[np.intp]:
     """Leave out every row without which the others still contradict each other."""
-    found = _least_excess(task, rows, (HIGHS,))
+
+    def contradict(some: NDArray[np.intp]) -> bool:
+        claim = HIGHS.run(_excess(task, some))  # as it says: many are asked, and each only leaves a row in or out
+        if claim is None or claim.verdict is not Verdict.OPTIMAL or claim.x is None:
+            return False
+        return bool(claim.x[task.M.shape[1] :].sum() > _ZERO)
+
+    found = solve(_excess(task, rows), (HIGHS,))
     rows = _proof(rows, found) if found.solved else rows  # a vertex has fewer multipliers than an interior point
-    for k in rows[:_MOST].copy():
+    # A record may contradict itself in many places: the shortest beginning that does so, and its shortest end, are one.
+    for _ in range(2):
+        few, many = 0, rows.size
+        while many - few > 1:
+            middle = (few + many) // 2
+            few, many = (few, middle) if contradict(rows[:middle]) else (middle, many)
+        rows = rows[:many][::-1]
+    for k in rows[1:-1][:_MOST].copy():
         rest = rows[rows != k]
-        found = _least_excess(task, rest, (HIGHS,))
-        if found.solved and found.x is not None and found.x[task.M.shape[1] :].sum() > _ZERO:
+        if contradict(rest):
             rows = rest
     return rows
 

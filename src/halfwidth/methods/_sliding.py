@@ -223,7 +223,11 @@ class Sliding:
             solved = self._program(method, model, part, a, costs)
             if solved is not None:
                 return solved
-        est = method.run(model, part, seed=self.seed) if self.carried is None else self._posterior(model, part, a)
+            est = method.answer(model, part, contradiction=False)
+        elif self.carried is not None:
+            est = self._posterior(model, part, a)
+        else:
+            est = method.run(model, part, seed=self.seed)
         s = np.full(model.nx + model.ny, np.nan) if est.q is None or est.r is None else np.r_[est.q, est.r]
         info = {
             k: v for k, v in est.info.items() if k in ("solver", "objective", "notes", "message", "gap", "half_widths")

@@ -212,6 +212,10 @@ class BatchLP:
     def run(self, model: Model, record: Record, *, seed: int | None = None) -> Estimate:  # noqa: ARG002
         """Estimate states and half-widths of one record."""
         assert isinstance(model, Linear)
+        return self.answer(model, record)
+
+    def answer(self, model: Linear, record: Record, *, contradiction: bool = True) -> Estimate:
+        """Estimate one record; a window among many does without the search for a contradiction, a second or so."""
         rows = residuals(model, record)
         floor, cap = _ends(model)
         # A uniform noise of known half-width q has the standard deviation q / sqrt(3).
@@ -236,7 +240,7 @@ class BatchLP:
                 task = task.grown(info["caps_grown"])
                 found, weight = self._minimise(task, solvers)
         if found.verdict is Verdict.INFEASIBLE:
-            return self._infeasible(model, record, task, solvers, found, info)
+            return self._infeasible(model, record, task, solvers, found, info, contradiction)
 
         status = _STATUS.get(found.verdict, Status.STALLED)
         if found.x is None or not status.good:
@@ -340,11 +344,12 @@ class BatchLP:
         solvers: Sequence[Solver],
         found: Solution,
         info: dict[str, Any],
+        contradiction: bool,
     ) -> Estimate:
         """Say which rows conflict, and what would reconcile them."""
         factor, inflated = inflation(task, solvers, np.ones_like(task.free))
         capped = bool(np.any(task.free & np.isfinite(task.highest)))
-        least, conflicts, contradiction = elastic(task, solvers, model, record)
+        least, conflicts, core = elastic(task, solvers, model, record, contradiction)
         X = next((v for v in (inflated, least) if v is not None), task.base.X)
         message = Status.INFEASIBLE.value
         if conflicts:
@@ -356,7 +361,7 @@ class BatchLP:
         info |= {
             "message": message,
             "conflicts": conflicts,
-            "contradiction": contradiction,
+            "contradiction": core,
             "inflation": factor,
             "solver": found.solver,
             "iterations": found.iterations,
