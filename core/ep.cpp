@@ -53,7 +53,7 @@ void settle_in(Ep<N>& ep, EpFound& f, Place& place) {
 
 template <class N>
 int run(N n, const EpArgs& a) {
-    for (int first = 0; first < a.members; first += lanes) {
+    for (int first = 0; first < a.members; first += wide_lanes) {
         Ep<N> ep{n, a, {first, a.members - 1}, {}, {}};
         EpFound f{};
         Place place{reinterpret_cast<V*>(a.work)};
@@ -63,12 +63,12 @@ int run(N n, const EpArgs& a) {
         EpState& s = ep.s;
         const std::ptrdiff_t stages = a.T + 1;
         const auto member = [&](int l) { return first + l < a.members ? first + l : a.members - 1; };
-        for (int l = 0; l < lanes; l++) {
+        for (int l = 0; l < wide_lanes; l++) {
             for (int g = 0; g < a.groups; g++) s.s[g].set(l, a.s[std::ptrdiff_t(member(l)) * a.groups + g]);
             s.eps.set(l, a.eps[member(l)]);
         }
         if (a.warm) {
-            for (int l = 0; l < lanes; l++) {
+            for (int l = 0; l < wide_lanes; l++) {
                 const std::ptrdiff_t k = member(l);
                 for (std::ptrdiff_t i = 0; i < stages * n; i++) {
                     s.m[i].set(l, a.m[k * stages * n + i]);
@@ -89,7 +89,7 @@ int run(N n, const EpArgs& a) {
         ep.cross = wanted;
         ep.look(f);
         if (a.k3) ep.shapes(a.k3, a.k4);
-        for (int l = 0; l < lanes && first + l < a.members; l++) {
+        for (int l = 0; l < wide_lanes && first + l < a.members; l++) {
             const std::ptrdiff_t k = first + l;
             a.log_z[k] = ep.sound(f, l) ? f.log_z[l] : minus_inf;
             a.residual[k] = f.residual[l];
@@ -112,7 +112,7 @@ int run(N n, const EpArgs& a) {
 
 template <class N>
 int learn(N n, const EpLearnArgs& a) {
-    Ep<N> ep{n, a.base, {0, lanes - 1}, {}, {}};
+    Ep<N> ep{n, a.base, {0, wide_lanes - 1}, {}, {}};
     EpLearner<N> learner{ep, a, {}, nullptr, nullptr, nullptr, nullptr, nullptr, 0, {}, {}, {}, 0, false};
     Place place{reinterpret_cast<V*>(a.base.work)};
     settle_in(ep, learner.f, place);
@@ -127,31 +127,35 @@ int learn(N n, const EpLearnArgs& a) {
 
 }  // namespace
 
-std::size_t ep_workspace(const EpArgs& a) { return block_size(a) * lanes; }
+std::size_t ep_workspace(const EpArgs& a) { return block_size(a) * wide_lanes; }
 
 int ep_run(const EpArgs& a) {
     const FlushTiny flush;
     switch (a.n) {
+#ifndef HW_FEW_SIZES
         case 1: return run(Dim<1>(), a);
         case 2: return run(Dim<2>(), a);
-        case 3: return run(Dim<3>(), a);
         case 4: return run(Dim<4>(), a);
+#endif
+        case 3: return run(Dim<3>(), a);
         default: return run(Dim<0>(a.n), a);
     }
 }
 
 std::size_t ep_learn_workspace(const EpLearnArgs& a) {
     const std::size_t more = 2 * std::size_t(a.base.T + 1) * a.base.n + 2 * std::size_t(a.base.rows) + a.base.groups + 1;
-    return ep_workspace(a.base) + more * lanes;
+    return ep_workspace(a.base) + more * wide_lanes;
 }
 
 int ep_learn(const EpLearnArgs& a) {
     const FlushTiny flush;
     switch (a.base.n) {
+#ifndef HW_FEW_SIZES
         case 1: return learn(Dim<1>(), a);
         case 2: return learn(Dim<2>(), a);
-        case 3: return learn(Dim<3>(), a);
         case 4: return learn(Dim<4>(), a);
+#endif
+        case 3: return learn(Dim<3>(), a);
         default: return learn(Dim<0>(a.base.n), a);
     }
 }

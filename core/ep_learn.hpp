@@ -4,8 +4,8 @@
 // s^power told^reference on (floor, cap), told^2 = mean over the rows of (1 - posterior variance / (s^2 / 3))^2: the square
 // root of what a row tells of log s (Jeffreys) and a power, 0 where the noise drowns and steady where it is seen. It has
 // no scale of its own. log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the
-// four lanes one holds phi, three hold phi + h e_j, whose slopes give three columns of the Hessian, other coordinates at
-// the next step. Around the mode, `nodes` points phi + H^(-1/2) z_k are evaluated and weighted by evidence over
+// lanes one holds phi, the others phi + h e_j, whose slopes give columns of the Hessian, other coordinates at the next
+// step where there are more coordinates than lanes. Around the mode, `nodes` points phi + H^(-1/2) z_k are evaluated and weighted by evidence over
 // proposal; the answer is their mixture. A half-width that may as well be 0 has an exponential tail in log s and none in a
 // power of s, so the search and the nodes live in u = s^warp (its density has the prior s^(a-warp) in log s, and at its
 // mode the two Hessians differ by du/dphi only). Sites follow phi from point to point, so a point costs few sweeps.
@@ -108,7 +108,7 @@ struct EpLearner {
         sweeps += ep.settle(f, most, tol, a.base.damping);
         ep.look(f);
         sweeps++;
-        for (int l = 0; l < lanes; l++) {
+        for (int l = 0; l < wide_lanes; l++) {
             const bool sound = ep.sound(f, l);
             if (!sound) dirty = true;
             value[l] = sound ? f.log_z[l] + log_prior(phi[l], l) : minus_inf;
@@ -189,10 +189,11 @@ struct EpLearner {
         double length = 1e9;
         int refused = 0;
         for (int k = 0; k < a.steps; k++) {
-            double at[lanes][ep_free], value[lanes], slope[lanes][ep_free], h[lanes] = {};
-            int along[lanes] = {-1, -1, -1, -1};
+            double at[wide_lanes][ep_free], value[wide_lanes], slope[wide_lanes][ep_free], h[wide_lanes] = {};
+            int along[wide_lanes];
+            for (int& j : along) j = -1;
             for (int j = 0; j < q; j++) trial[j] = min2(max2(phi[j] + d[j], lo[j]), hi[j]);
-            for (int l = 0; l < lanes; l++) {
+            for (int l = 0; l < wide_lanes; l++) {
                 for (int j = 0; j < q; j++) at[l][j] = trial[j];
                 if (l == 0 || l > q) continue;
                 const int j = next;
@@ -202,7 +203,7 @@ struct EpLearner {
                 along[l] = j;
                 at[l][j] += h[l];
             }
-            for (int l = 0; l < lanes; l++) put(l, at[l]);
+            for (int l = 0; l < wide_lanes; l++) put(l, at[l]);
             if (k > 0 || warm) recall();
             else ep.start();
             evaluate(at, k > 0 || warm ? a.few : a.many, a.tol, value, slope);
@@ -229,7 +230,7 @@ struct EpLearner {
                 phi[j] = trial[j];
                 g[j] = slope[0][j];
             }
-            for (int l = 1; l < lanes; l++)
+            for (int l = 1; l < wide_lanes; l++)
                 if (along[l] >= 0 && value[l] > minus_inf) {
                     for (int i = 0; i < q; i++) column[along[l]][i] = -(slope[l][i] - slope[0][i]) / h[l];
                     // an unmeasured column mirrors a measured one
@@ -303,7 +304,7 @@ struct EpLearner {
             const double start = group[j] >= 0 ? std::log(max2(a.start[group[j]], 1e-300)) : a.start_eps;
             phi[j] = min2(max2(start, lo[j]), hi[j]);
         }
-        for (int l = 0; l < lanes; l++) {
+        for (int l = 0; l < wide_lanes; l++) {
             for (int g = 0; g < b.groups; g++) ep.s.s[g].set(l, a.start[g]);
             ep.s.eps.set(l, a.rate);
             put(l, phi);
@@ -331,7 +332,7 @@ struct EpLearner {
             if (code == 2) return 2;
             for (double keep = 1.0; !factor(H, keep, L); keep *= 0.7) {}
         } else {
-            double at[lanes][ep_free] = {}, value[lanes], slope[lanes][ep_free];
+            double at[wide_lanes][ep_free] = {}, value[wide_lanes], slope[wide_lanes][ep_free];
             if (warm) recall();
             else ep.start();
             evaluate(at, a.most, a.tol_nodes, value, slope);
@@ -367,10 +368,10 @@ struct EpLearner {
         double top = minus_inf, sum = 0.0;
         *a.residual = 0.0;
         bool first = true;
-        for (int k = 0; k < nodes; k += lanes) {
-            double at[lanes][ep_free], value[lanes], slope[lanes][ep_free];
-            bool inside[lanes];
-            for (int l = 0; l < lanes; l++) {
+        for (int k = 0; k < nodes; k += wide_lanes) {
+            double at[wide_lanes][ep_free], value[wide_lanes], slope[wide_lanes][ep_free];
+            bool inside[wide_lanes];
+            for (int l = 0; l < wide_lanes; l++) {
                 inside[l] = k + l < nodes;
                 for (int j = 0; j < q; j++) at[l][j] = phi[j];
                 if (nodes > 1 && inside[l]) {
@@ -393,7 +394,7 @@ struct EpLearner {
             recall();
             evaluate(at, a.most, a.tol_nodes, value, slope);
             ep.shapes(b.k3, b.k4);
-            for (int l = 0; l < lanes && k + l < nodes; l++) {
+            for (int l = 0; l < wide_lanes && k + l < nodes; l++) {
                 for (int j = 0; j < q; j++) a.phi[(k + l) * q + j] = at[l][j];
                 double lw = inside[l] && value[l] > minus_inf ? value[l] - (nodes > 1 ? a.log_proposal[k + l] : 0.0) : minus_inf;
                 a.log_weight[k + l] = lw;
