@@ -215,7 +215,8 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
 
 nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale, In start, In count, bool learn_eps,
                double rate, double start_eps, double power, double beta_a, double beta_b, In z, In log_proposal,
-               const nb::dict& limits, std::optional<nb::tuple> sites, std::optional<In> was) {
+               const nb::dict& limits, std::optional<nb::tuple> sites, std::optional<In> was, std::optional<In> pull,
+               std::optional<In> precision) {
     constexpr std::size_t abreast = hw::ep_abreast;
     Problem p(problem, abreast);
     hw::EpLearnArgs l{};
@@ -236,6 +237,12 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     l.was = was ? was->data() : start.data();
     want(!was || was->size() == groups, "was (groups,)");
     l.count = count.data();
+    want(pull.has_value() == precision.has_value(), "pull and precision go together");
+    if (pull) {
+        want(pull->size() == groups && precision->size() == groups * groups, "pull (groups,), precision (groups,groups)");
+        l.pull = pull->data();
+        l.precision = precision->data();
+    }
     l.learn_eps = learn_eps;
     l.rate = rate;
     l.start_eps = start_eps;
@@ -275,6 +282,7 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     found["H"] = fresh({q, q}, &l.H);
     found["phi"] = fresh({nodes, q}, &l.phi);
     found["log_weight"] = fresh({nodes}, &l.log_weight);
+    found["slope"] = fresh({nodes, q}, &l.node_slope);
     found["x"] = fresh({stages, n}, &l.x);
     found["P"] = fresh({stages, n, n}, &l.P);
     found["k3"] = fresh({stages, n}, &l.k3);
@@ -316,6 +324,6 @@ void bind_ep(nb::module_& mod) {
             "Expectation propagation on a chain for given half-widths, one set a member; see core/ep_entry.hpp.");
     mod.def("ep_learn", &learn, "problem"_a, "free"_a, "floor"_a, "cap"_a, "scale"_a, "start"_a, "count"_a, "learn_eps"_a,
             "rate"_a, "start_eps"_a, "power"_a, "beta_a"_a, "beta_b"_a, "z"_a, "log_proposal"_a, "limits"_a,
-            "sites"_a.none(), "was"_a.none(),
+            "sites"_a.none(), "was"_a.none(), "pull"_a.none() = nb::none(), "precision"_a.none() = nb::none(),
             "The same with half-widths found by evidence and what is not known of them carried into the answer.");
 }

@@ -113,15 +113,16 @@ int run(N n, const EpArgs& a) {
 template <class N>
 int learn(N n, const EpLearnArgs& a) {
     Ep<N> ep{n, a.base, {0, wide_lanes - 1}, {}, {}};
-    EpLearner<N> learner{ep, a, {}, nullptr, nullptr, nullptr, nullptr, nullptr, 0, {}, {}, {}, 0, false};
+    EpLearner<N> learner{ep, a};
     Place place{reinterpret_cast<V*>(a.base.work)};
     settle_in(ep, learner.f, place);
     const std::ptrdiff_t size = std::ptrdiff_t(a.base.T + 1) * n;
-    learner.keep_m = place.take(size);
-    learner.keep_D = place.take(size);
-    learner.keep_tau = place.take(a.base.rows);
-    learner.keep_nu = place.take(a.base.rows);
-    learner.was = place.take(a.base.groups + 1);
+    double* p = reinterpret_cast<double*>(place.p);
+    learner.keep_m = p;
+    learner.keep_D = learner.keep_m + size;
+    learner.keep_tau = learner.keep_D + size;
+    learner.keep_nu = learner.keep_tau + a.base.rows;
+    learner.lead = learner.keep_nu + a.base.rows;  // 2 * sites * parameters
     return learner.run();
 }
 
@@ -143,8 +144,10 @@ int ep_run(const EpArgs& a) {
 }
 
 std::size_t ep_learn_workspace(const EpLearnArgs& a) {
-    const std::size_t more = 2 * std::size_t(a.base.T + 1) * a.base.n + 2 * std::size_t(a.base.rows) + a.base.groups + 1;
-    return ep_workspace(a.base) + more * wide_lanes;
+    std::size_t q = a.learn_eps ? 1 : 0;
+    for (int g = 0; g < a.base.groups; g++) q += a.free[g] ? 1 : 0;
+    const std::size_t sites = std::size_t(a.base.T + 1) * a.base.n + a.base.rows;
+    return ep_workspace(a.base) + 2 * sites * (1 + q);
 }
 
 int ep_learn(const EpLearnArgs& a) {

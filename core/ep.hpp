@@ -244,23 +244,6 @@ struct Ep {
         for (int k = 0; k < (a.T + 1) * packed(); k++) s.Lb[k] = V(0.0);
     }
 
-    // sites follow half-widths that change from `was` to s.s
-    void rescale(const V* was) {
-        for (int t = 1; t <= a.T; t++)
-            for (int i = 0; i < n; i++)
-                if (a.group_w[i] >= 0) {
-                    const V f = s.s[a.group_w[i]] / larger(was[a.group_w[i]], V(1e-300));
-                    s.D[t * n + i] *= f * f;
-                    s.m[t * n + i] *= f;
-                }
-        for (int k = 0; k < a.rows; k++)
-            if (kind(k) != noise_gaussian && kind(k) != ep_truncation && a.group[k] >= 0) {
-                const V f = was[a.group[k]] / larger(s.s[a.group[k]], V(1e-300));
-                s.tau[k] *= f * f;
-                s.nu[k] *= f;
-            }
-    }
-
     // ---- a stage -------------------------------------------------------------------------------------------------
 
     // predicted moments of x_0

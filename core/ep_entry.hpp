@@ -68,12 +68,14 @@ struct EpLearnArgs {
     double rate, start_eps;                  // the rate where it is known; logit of the first guess
     double power, reference, warp;           // prior of log s: s^power told^reference; nodes are Gaussian in s^warp
     double beta_a, beta_b;                   // prior of the rate
+    const double *pull, *precision;          // (groups,), (groups,groups): what is known already, in u = s^warp; or null
     int steps, few, many, most;              // Newton steps; sweeps of a step, of the first one, of a node
     double tol, tol_nodes, close, least, narrow;
     int nodes;
     const double *z, *log_proposal;          // (nodes, q), (nodes,)
     // found
     double *mode, *H, *phi, *log_weight;     // (q,), (q,q), (nodes,q), (nodes,)
+    double *node_slope;                      // (nodes,q): d log Z / d phi at each node
     double *x, *P, *k3, *k4, *centre, *out;  // (T+1,n), (T+1,n,n), ...: of the mixture; out (rows,) or null
     double *log_evidence, *log_mode, *log_prior, *residual;  // of the data; Z times prior, and the prior, at the mode
     std::int32_t* used;                      // nodes

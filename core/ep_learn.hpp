@@ -3,9 +3,10 @@
 // phi = log s of the free half-widths, logit eps last if it is learned. The prior of a rate is a beta law. That of log s is
 // s^power told^reference on (floor, cap), told^2 = mean over the rows of (1 - posterior variance / (s^2 / 3))^2: the square
 // root of what a row tells of log s (Jeffreys) and a power, 0 where the noise drowns and steady where it is seen. It has
-// no scale of its own. log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the
-// lanes one holds phi, the others phi + h e_j, whose slopes give columns of the Hessian, other coordinates at the next
-// step where there are more coordinates than lanes. Around the mode, `nodes` points phi + H^(-1/2) z_k are evaluated and weighted by evidence over
+// no scale of its own. What other data have told is a term pull'u - u'precision u / 2 beside it, u = s^warp.
+// log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the lanes one holds phi, the others
+// phi + h e_j, whose slopes give columns of the Hessian, other coordinates at the next step where there are more
+// coordinates than lanes. Around the mode, `nodes` points phi + H^(-1/2) z_k are evaluated and weighted by evidence over
 // proposal; the answer is their mixture. A half-width that may as well be 0 has an exponential tail in log s and none in a
 // power of s, so the search and the nodes live in u = s^warp (its density has the prior s^(a-warp) in log s, and at its
 // mode the two Hessians differ by du/dphi only). Sites follow phi from point to point, so a point costs few sweeps.
@@ -22,12 +23,11 @@ template <class N>
 struct EpLearner {
     Ep<N>& ep;
     const EpLearnArgs& a;
-    EpFound f;
-    V *keep_m, *keep_D, *keep_tau, *keep_nu;  // sites of the best point
-    V* was;                                   // (groups,)
+    EpFound f{};
+    double *keep_m = nullptr, *keep_D = nullptr, *keep_tau = nullptr, *keep_nu = nullptr;  // sites of the best point
     int q = 0;                                // parameters
-    int group[ep_free];                       // half-width of a parameter, -1: the rate
-    double lo[ep_free], hi[ep_free];
+    int group[ep_free] = {};                  // half-width of a parameter, -1: the rate
+    double lo[ep_free] = {}, hi[ep_free] = {};
     long sweeps = 0;
 
     std::ptrdiff_t stage_count() const { return static_cast<std::ptrdiff_t>(a.base.T + 1) * ep.n; }
@@ -57,16 +57,44 @@ struct EpLearner {
         return std::sqrt(min2(max2(f.learned[group[j]][l] / max2(a.count[group[j]], 1.0), 1e-12), 1.0));
     }
     double log_prior(const double* phi, int l) const {
-        double p = 0.0;
+        double p = known(phi);
         for (int j = 0; j < q; j++)
             p += group[j] >= 0 ? (a.power - a.warp) * phi[j] + a.reference * std::log(told(j, l))
                                : a.beta_a * phi[j] - (a.beta_a + a.beta_b) * std::log1p(std::exp(phi[j]));
         return p;
     }
     // What is told grows with s^2 / (s^2 + what blurs it), so d log told / d log s = 2 (1 - told), near enough for a search.
-    double prior_slope(int j, double phi, int l) const {
-        return group[j] >= 0 ? a.power - a.warp + 2.0 * a.reference * (1.0 - told(j, l))
-                             : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi));
+    double prior_slope(int j, const double* phi, int l) const {
+        return group[j] >= 0 ? a.power - a.warp + 2.0 * a.reference * (1.0 - told(j, l)) + known_slope(j, phi)
+                             : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi[j]));
+    }
+
+    // What is known already of the half-widths: its logarithm up to a constant, its slope in log s_j, and minus the
+    // curvature of the Gaussian in it.
+    double power_of(int j, const double* phi) const { return std::exp(a.warp * phi[j]); }
+    double precision(int i, int j) const { return a.precision[group[i] * a.base.groups + group[j]]; }
+    double known(const double* phi) const {
+        double p = 0.0;
+        if (a.pull)
+            for (int i = 0; i < q; i++)
+                if (group[i] >= 0) {
+                    double half = a.pull[group[i]];
+                    for (int j = 0; j < q; j++)
+                        if (group[j] >= 0) half -= 0.5 * precision(i, j) * power_of(j, phi);
+                    p += half * power_of(i, phi);
+                }
+        return p;
+    }
+    double known_slope(int i, const double* phi) const {
+        if (!a.pull) return 0.0;
+        double d = a.pull[group[i]];
+        for (int j = 0; j < q; j++)
+            if (group[j] >= 0) d -= precision(i, j) * power_of(j, phi);
+        return a.warp * power_of(i, phi) * d;
+    }
+    double known_curve(int i, int j, const double* phi) const {
+        if (!a.pull || group[i] < 0 || group[j] < 0) return 0.0;
+        return a.warp * a.warp * power_of(i, phi) * power_of(j, phi) * precision(i, j);
     }
 
     // parameters of lane l
@@ -76,32 +104,100 @@ struct EpLearner {
             else ep.s.eps.set(l, 1.0 / (1.0 + std::exp(-phi[j])));
         }
     }
-    void remember(int l) {
-        for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
-            keep_m[k] = V(ep.s.m[k][l]);
-            keep_D[k] = V(ep.s.D[k][l]);
-        }
-        for (int k = 0; k < a.base.rows; k++) {
-            keep_tau[k] = V(ep.s.tau[k][l]);
-            keep_nu[k] = V(ep.s.nu[k][l]);
-        }
-        for (int g = 0; g < a.base.groups; g++) was[g] = V(ep.s.s[g][l]);
+    // ---- sites follow the parameters: log-linear in D and tau, linear in means ------------------------------------
+
+    // lead[(site * 2 + i) * q + j] = d (log precision, mean) / d phi_j of the site, w's first, then the rows'
+    double* lead = nullptr;
+    double kept[ep_free] = {};      // parameters of the sites that are kept
+    bool followed[ep_free] = {};    // lead was measured; else sites keep their shape over their own half-width
+    bool dirty = false;             // the message may hold what is not finite
+
+    int group_of(std::ptrdiff_t site) const {
+        const std::ptrdiff_t k = site - stage_count();
+        if (k < 0) return site < ep.n ? -1 : a.base.group_w[site % ep.n];
+        return a.base.kind[k] == noise_gaussian || a.base.kind[k] == ep_truncation ? -1 : a.base.group[k];
     }
-    // every lane starts from the remembered sites, drawn along with its own half-widths
-    void recall() {
+    // keep the sites of lane l, which belong to phi
+    void remember(int l, const double* phi) {
         for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
-            ep.s.m[k] = keep_m[k];
-            ep.s.D[k] = keep_D[k];
+            keep_m[k] = ep.s.m[k][l];
+            keep_D[k] = ep.s.D[k][l];
         }
         for (int k = 0; k < a.base.rows; k++) {
-            ep.s.tau[k] = keep_tau[k];
-            ep.s.nu[k] = keep_nu[k];
+            keep_tau[k] = ep.s.tau[k][l];
+            keep_nu[k] = ep.s.nu[k][l];
         }
-        ep.rescale(was);
+        keep(phi);
+    }
+    void keep(const double* phi) {
+        const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
+        for (int j = 0; j < q; j++) {
+            kept[j] = phi[j];
+            if (followed[j]) continue;
+            for (std::ptrdiff_t site = 0; site < sites; site++) {
+                const bool own = group[j] >= 0 && group_of(site) == group[j];
+                const std::ptrdiff_t k = site - stages;
+                const double mean = k < 0 ? keep_m[site] : keep_tau[k] > 0.0 ? keep_nu[k] / keep_tau[k] : 0.0;
+                lead[2 * site * q + j] = own ? -2.0 : 0.0;
+                lead[(2 * site + 1) * q + j] = own ? mean : 0.0;
+            }
+        }
+    }
+    // measure how the sites follow: lane l has parameter along[l] moved by h[l] from those of lane 0
+    void follow(const int* along, const double* h, const double* value) {
+        const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
+        V over(0.0);
+        int lane[wide_lanes], count = 0;
+        for (int l = 1; l < wide_lanes; l++)
+            if (along[l] >= 0 && value[l] > minus_inf) {
+                over.set(l, 1.0 / h[l]);
+                followed[along[l]] = true;
+                lane[count++] = l;
+            }
+        for (std::ptrdiff_t site = 0; site < sites; site++) {
+            const std::ptrdiff_t k = site - stages;
+            const V own = k < 0 ? ep.s.D[site] : ep.s.tau[k];
+            V turn(0.0), move(0.0);
+            if (own[0] > 0.0) {
+                const V log_own = log_of(own), mean = k < 0 ? ep.s.m[site] : ep.s.nu[k] / larger(own, V(1e-300));
+                turn = (log_own - V(log_own[0])) * over * V(k < 0 ? -1.0 : 1.0);
+                move = (mean - V(mean[0])) * over;
+                turn = V::of(own.v > X{} ? max4(min4(turn.v, all<X>(20.0)), all<X>(-20.0)) : X{});
+                move = V::of(own.v > X{} ? move.v : X{});
+            }
+            for (int c = 0; c < count; c++) {
+                lead[2 * site * q + along[lane[c]]] = turn[lane[c]];
+                lead[(2 * site + 1) * q + along[lane[c]]] = move[lane[c]];
+            }
+        }
+    }
+    // every lane starts from the sites that are kept, drawn along to its own parameters
+    void recall(const double (*phi)[ep_free]) {
+        const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
+        V d[ep_free];
+        for (int j = 0; j < q; j++)
+            for (int l = 0; l < wide_lanes; l++) d[j].set(l, phi[l][j] - kept[j]);
+        for (std::ptrdiff_t site = 0; site < sites; site++) {
+            const std::ptrdiff_t k = site - stages;
+            const double own = k < 0 ? keep_D[site] : keep_tau[k];
+            V turn(0.0), mean(k < 0 ? keep_m[site] : own > 0.0 ? keep_nu[k] / own : 0.0);
+            if (own > 0.0 && (k < 0 || a.base.kind[k] != noise_gaussian))
+                for (int j = 0; j < q; j++) {
+                    turn += V(lead[2 * site * q + j]) * d[j];
+                    mean += V(lead[(2 * site + 1) * q + j]) * d[j];
+                }
+            turn = V::of(exp4(max4(min4(turn.v, all<X>(6.0)), all<X>(-6.0))));
+            if (k < 0) {
+                ep.s.D[site] = V(own) / turn;
+                ep.s.m[site] = mean;
+            } else {
+                ep.s.tau[k] = V(own) * turn;
+                ep.s.nu[k] = ep.s.tau[k] * mean;
+            }
+        }
         if (dirty) ep.forget();
         dirty = false;
     }
-    bool dirty = false;  // the message may hold what is not finite
 
     // evaluate the lanes; value[l] = log posterior up to a constant, slope[l][j]
     void evaluate(const double (*phi)[ep_free], int most, double tol, double* value, double (*slope)[ep_free]) {
@@ -113,7 +209,7 @@ struct EpLearner {
             if (!sound) dirty = true;
             value[l] = sound ? f.log_z[l] + log_prior(phi[l], l) : minus_inf;
             for (int j = 0; j < q; j++)
-                slope[l][j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l] + prior_slope(j, phi[l][j], l);
+                slope[l][j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l] + prior_slope(j, phi[l], l);
         }
     }
 
@@ -182,7 +278,10 @@ struct EpLearner {
     int climb(double* phi, double (*H)[ep_free], double* best, bool warm) {
         double column[ep_free][ep_free] = {}, g[ep_free] = {};
         bool measured[ep_free] = {};
-        for (int j = 0; j < q; j++) column[j][j] = max2(group[j] >= 0 ? 0.3 * a.count[group[j]] : 1.0, a.least);
+        for (int j = 0; j < q; j++) {
+            for (int i = 0; i < q; i++) column[j][i] = known_curve(i, j, phi);
+            column[j][j] += max2(group[j] >= 0 ? 0.3 * a.count[group[j]] : 1.0, a.least);
+        }
         int next = 0, missing = q;
         *best = minus_inf;
         double d[ep_free] = {}, trial[ep_free];
@@ -204,16 +303,14 @@ struct EpLearner {
                 at[l][j] += h[l];
             }
             for (int l = 0; l < wide_lanes; l++) put(l, at[l]);
-            if (k > 0 || warm) recall();
+            if (k > 0 || warm) recall(at);
             else ep.start();
             evaluate(at, k > 0 || warm ? a.few : a.many, a.tol, value, slope);
             if (!(value[0] > *best - 0.05 * q) && refused < 6) {  // too far, or no trajectory fits
                 refused++;
                 if (*best == minus_inf) {  // the start itself: wider half-widths fit more
                     for (int j = 0; j < q; j++) phi[j] = min2(max2(phi[j] + (group[j] >= 0 ? 0.7 : 0.0), lo[j]), hi[j]);
-                    ep.start();
                     dirty = false;
-                    remember(0);
                     warm = false;
                     k = -1;
                     if (refused == 6) return 2;
@@ -239,7 +336,8 @@ struct EpLearner {
                     if (!measured[along[l]]) missing--;
                     measured[along[l]] = true;
                 }
-            remember(0);
+            remember(0, phi);
+            follow(along, h, value);
             hessian(column, H);
             length = step(H, phi, g, d);
             if (length < a.close && missing == 0) return 0;
@@ -311,15 +409,17 @@ struct EpLearner {
         }
         const bool warm = b.warm;
         if (warm) {
+            double from[ep_free];
             for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
-                keep_m[k] = V(b.m[k]);
-                keep_D[k] = V(b.D[k]);
+                keep_m[k] = b.m[k];
+                keep_D[k] = b.D[k];
             }
             for (int k = 0; k < b.rows; k++) {
-                keep_tau[k] = V(b.tau[k]);
-                keep_nu[k] = V(b.nu[k]);
+                keep_tau[k] = b.tau[k];
+                keep_nu[k] = b.nu[k];
             }
-            for (int g = 0; g < b.groups; g++) was[g] = V(a.was[g]);
+            for (int j = 0; j < q; j++) from[j] = group[j] >= 0 ? std::log(max2(a.was[group[j]], 1e-300)) : phi[j];
+            keep(from);
             ep.forget();
         }
         const EpCross wanted = ep.cross;
@@ -333,13 +433,13 @@ struct EpLearner {
             for (double keep = 1.0; !factor(H, keep, L); keep *= 0.7) {}
         } else {
             double at[wide_lanes][ep_free] = {}, value[wide_lanes], slope[wide_lanes][ep_free];
-            if (warm) recall();
+            if (warm) recall(at);
             else ep.start();
             evaluate(at, a.most, a.tol_nodes, value, slope);
             if (value[0] == minus_inf) return 2;
             best = value[0];
             if (!(f.residual[0] < a.tol_nodes)) code = 1;
-            remember(0);
+            remember(0, phi);
         }
         for (int j = 0; j < q; j++) {
             a.mode[j] = phi[j];
@@ -347,12 +447,12 @@ struct EpLearner {
         }
         // sites of the mode, for a warm start
         for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
-            b.m[k] = keep_m[k][0];
-            b.D[k] = keep_D[k][0];
+            b.m[k] = keep_m[k];
+            b.D[k] = keep_D[k];
         }
         for (int k = 0; k < b.rows; k++) {
-            b.tau[k] = keep_tau[k][0];
-            b.nu[k] = keep_nu[k][0];
+            b.tau[k] = keep_tau[k];
+            b.nu[k] = keep_nu[k];
         }
         // Little is left to be known of the parameters: one node does.
         double wide = 0.0;
@@ -391,11 +491,14 @@ struct EpLearner {
                 }
                 put(l, at[l]);
             }
-            recall();
+            recall(at);
             evaluate(at, a.most, a.tol_nodes, value, slope);
             ep.shapes(b.k3, b.k4);
             for (int l = 0; l < wide_lanes && k + l < nodes; l++) {
-                for (int j = 0; j < q; j++) a.phi[(k + l) * q + j] = at[l][j];
+                for (int j = 0; j < q; j++) {
+                    a.phi[(k + l) * q + j] = at[l][j];
+                    a.node_slope[(k + l) * q + j] = f.slope[group[j] >= 0 ? group[j] : b.groups][l];
+                }
                 double lw = inside[l] && value[l] > minus_inf ? value[l] - (nodes > 1 ? a.log_proposal[k + l] : 0.0) : minus_inf;
                 a.log_weight[k + l] = lw;
                 if (lw == minus_inf) continue;

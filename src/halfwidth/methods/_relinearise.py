@@ -15,24 +15,28 @@ from halfwidth.methods._sites import uniform_part
 from halfwidth.model import Linear, Nonlinear, arity
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
-from halfwidth.result import Estimate, Status
+from halfwidth.result import Status
 from halfwidth.spread import Normal
 from halfwidth.trace import Untraceable, compiled
 
 if TYPE_CHECKING:
-    from halfwidth.methods.posterior import Posterior
+    from halfwidth.methods._carry import Known
+    from halfwidth.methods.posterior import Answer, Posterior, Start
 
 #: A step below this share of the standard deviations ends the iteration, and one below the second is good enough.
 _CLOSE, _USABLE = 1e-3, 0.1
 
 
-def relinearised(method: "Posterior", model: Nonlinear, record: Record) -> Estimate:
-    """Estimate the states of one record of a nonlinear model."""
+def relinearised(
+    method: "Posterior", model: Nonlinear, record: Record, *, s: Array | None = None, known: "Known | None" = None
+) -> "Answer":
+    """Estimate the states of one record of a nonlinear model; `s` and `known` are as in `Posterior.answer`."""
     X = _first_path(model, record)
-    start, moved, rounds = None, np.inf, 0
+    start: Start | Array | None = s
+    moved, rounds = np.inf, 0
     while True:
         linear, local = linearised(model, record, X)
-        answer = method.answer(linear, local, start=start)
+        answer = method.answer(linear, local, start=start, known=known)
         est = answer.estimate
         rounds += 1
         if not est.status.good:
@@ -47,7 +51,8 @@ def relinearised(method: "Posterior", model: Nonlinear, record: Record) -> Estim
     if status.good and moved > _CLOSE:
         status = Status.REDUCED if moved < _USABLE else Status.STALLED
         info["message"] = f"{status.value}: after {rounds} linearisations the states still move by {moved:.2g} sd"
-    return replace(est, status=status, names=model.names.x, labels=record.labels, info=info)
+    est = replace(est, status=status, names=model.names.x, labels=record.labels, info=info)
+    return answer._replace(estimate=est)
 
 
 def linearised(model: Nonlinear, record: Record, X: Array) -> tuple[Linear, Record]:

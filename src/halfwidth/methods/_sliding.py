@@ -22,9 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from halfwidth.array import Array
+from halfwidth.methods._carry import Carried
 from halfwidth.methods._protocol import Estimator, pushed_row, typed
 from halfwidth.methods._residuals import reference, residuals
 from halfwidth.methods.map import BatchLP
+from halfwidth.methods.posterior import Posterior
 from halfwidth.methods.sequential import (
     SequentialLP,
     expected,
@@ -130,6 +132,7 @@ class Sliding:
         self.costs: Array | None = None
         self.start: Start | None = None
         self.last: Solved | None = None
+        self.carried = carried_of(window, model)
 
     def push(self, y: Array, u: Array | None, dt: float) -> Solved:
         """Fold one row in: solve the window that ends in it."""
@@ -144,6 +147,8 @@ class Sliding:
         a = int(window_starts(seen, window.memory, fixes=window.fixes, stretch=window.stretch)[-1])
         last = window_lasts(seen, window.memory, self.used, self.edge)  # by place: the first is before the rows held
         part = Record(np.array(self.times[a:]), np.array(self.y[a:]), np.array(self.u[a:]) if model.nu else None)
+        if self.carried is not None:
+            self.carried.leave(a)
         local = self._local(a, len(self.times) - 1 >= last[a])
         self.since = 0 if seen[-1].any() else self.since + 1
         method = window.method
@@ -196,7 +201,9 @@ class Sliding:
             for name, matrix in model.matrices.items():
                 if matrix.value is not None and matrix.value.ndim == 3:
                     changes[name] = matrix.value[rows]
-        if rows.start > 0 and isinstance(model.x0, Box):
+        if rows.start > 0 and self.carried is not None and self.carried.first is not None:
+            changes["x0"] = self.carried.first
+        elif rows.start > 0 and (isinstance(model.x0, Box) or self.carried is not None):
             free = Box(np.full(model.nx, -np.inf), np.full(model.nx, np.inf))
             box = model.bounds if isinstance(model.bounds, Box) else free
             held = interval(self.low[a], self.high[a], self.window.memory, self.window.carry) if finished else None
@@ -212,13 +219,24 @@ class Sliding:
             solved = self._program(method, model, part, a, costs)
             if solved is not None:
                 return solved
-        est = method.run(model, part, seed=self.seed)
+        est = method.run(model, part, seed=self.seed) if self.carried is None else self._posterior(model, part, a)
         s = np.full(model.nx + model.ny, np.nan) if est.q is None or est.r is None else np.r_[est.q, est.r]
         info = {k: v for k, v in est.info.items() if k in ("solver", "objective", "notes", "message", "gap")}
         return Solved(
             np.vstack([est.info.get("x0", self.x[a]), est.x]), np.zeros(0) if est.theta is None else est.theta, s,
             est.status, int(est.info.get("iterations", 0) or 0), info, rows_of_spread(est.spread, slice(-1, None)),
         )  # fmt: skip
+
+    def _posterior(self, model: Model, part: Record, a: int) -> Estimate:
+        """Estimate one window with what the rows before it told."""
+        held, method = self.carried, self.window.method
+        assert held is not None and isinstance(method, Posterior)
+        seen = part.seen.any(axis=1)
+        answer = method.resumed(model, part, held.s, held.known(self.first + a))
+        newest = self.first + len(self.times) - 1
+        rows = max(int(seen.sum()), self.window.memory + 1)
+        held.take(answer, newest, rows, counts=bool(seen[-1]))
+        return answer.estimate
 
     def _costs(self, model: Model, part: Record) -> Array:
         """Return the scales of the first full window, or of the rows there are."""
@@ -299,6 +317,7 @@ class Sliding:
             "ahead": [plain(self.ahead.x), plain(self.ahead.q), self.ahead.grown.tolist()],
             "theta": self.theta.tolist(), "costs": None if self.costs is None else self.costs.tolist(),
             "start": None if self.start is None else [part.tolist() for part in self.start],
+            "carried": None if self.carried is None else self.carried.save(),
             "last": None if last is None else [last.theta.tolist(), plain([last.s])[0], last.status.name],
         }  # fmt: skip
 
@@ -328,6 +347,8 @@ class Sliding:
             self.start = (
                 x.reshape(-1, nx), theta, s, lam.reshape(-1, kinds, 2), box.reshape(-1, nx, 2), ends.reshape(-1, 2)
             )  # fmt: skip
+        if self.carried is not None:
+            self.carried.load(saved["carried"])
         self.last = None
         if saved["last"] is not None:
             theta, s, status = saved["last"]
@@ -495,6 +516,16 @@ def first_costs(model: Linear, record: Record, rows: int) -> Array:
     base = reference(residuals(short, first), short, np.where(floor == cap, floor / math.sqrt(3.0), 0.0))
     count = np.r_[np.full(model.nx, b), first.seen.sum(axis=0)]
     return scaled_costs(count, base.sigma)
+
+
+def carried_of(window: "Window", model: Model) -> Carried | None:
+    """Return what hands knowledge from window to window, for a method that can take it."""
+    method = window.method
+    if window.recall == 0 or not isinstance(method, Posterior) or method.method != "ep":
+        return None
+    if isinstance(model, Linear) and model.theta_entries:
+        return None
+    return Carried(model.nx + model.ny, window.recall * (window.memory + 1))
 
 
 def shares_costs(method: Estimator, model: Model) -> bool:

@@ -31,6 +31,7 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
+from halfwidth.methods._carry import WARP, Known
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Sites, gaussian_part, sites, uniform_part
 from halfwidth.model import Linear, Model, Nonlinear
@@ -42,11 +43,9 @@ from halfwidth.spread import Box, Normal, Shaped
 _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
 POWER = 0.85
-#: Nodes are Gaussian in this power of a half-width: there a half-width that may be 0 has no tail.
-_WARP = 0.5
 _LIMITS = {
     "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.25, "least": 0.3,
-    "narrow": 0.03, "damping": 0.7, "warp": _WARP, "reference": 1.0,
+    "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
 }  # fmt: skip
 #: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
 #: with them; there is less left to integrate.
@@ -201,17 +200,28 @@ class Posterior:
         if isinstance(model, Nonlinear):
             from halfwidth.methods._relinearise import relinearised
 
-            return relinearised(self, model, record)
+            return relinearised(self, model, record).estimate
         if model.theta_entries:
             from halfwidth.methods._entries import with_entries
 
             return with_entries(self, model, record)
         return self.answer(model, record).estimate
 
-    def answer(self, model: Linear, record: Record, *, start: "Start | Array | None" = None) -> "Answer":
+    def resumed(self, model: Model, record: Record, s: Array | None, known: Known | None) -> "Answer":
+        """Return the answer of one window of a stream; `s` is where to start, `known` what earlier rows told."""
+        if isinstance(model, Nonlinear):
+            from halfwidth.methods._relinearise import relinearised
+
+            return relinearised(self, model, record, s=s, known=known)
+        return self.answer(model, record, start=s, known=known)
+
+    def answer(
+        self, model: Linear, record: Record, *, start: "Start | Array | None" = None, known: Known | None = None
+    ) -> "Answer":
         """Return the estimate of a model without unknown entries, and what the next one may start from.
 
-        `start` holds half-widths (p,), with the sites that belong to them if the chain has the same shape.
+        `start` holds half-widths (p,), with the sites that belong to them if the chain has the same shape; `known` is
+        what other rows told of half-widths.
         """
         if isinstance(start, np.ndarray):
             start = Start(start, None)
@@ -227,10 +237,11 @@ class Posterior:
                 quick = None
             if quick is not None and int(quick.found["code"]) < 2:
                 start = Start(np.where(quick.chain.free, quick.start.s, math.sqrt(3.0) * problem.scale), None)
-        found = self._solve(problem, model, start)
-        return Answer(self._estimate(problem, found, model, record), problem, found)
+        known = None if known is None else known.of(problem.free)
+        found = self._solve(problem, model, start, known)
+        return Answer(self._estimate(problem, found, model, record), problem, found, known)
 
-    def _solve(self, chain: Sites, model: Linear, start: "Start | None") -> dict[str, Any]:
+    def _solve(self, chain: Sites, model: Linear, start: "Start | None", known: Known | None) -> dict[str, Any]:
         rate, learn_rate, beta = self._rate(model)
         first = np.where(chain.uniform, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), 0.0)
         first = np.where(chain.free, first, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
@@ -256,7 +267,8 @@ class Posterior:
             _core.ep_learn(
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
                 learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z, log_proposal,
-                limits, sites_, was,
+                limits, sites_, was, None if known is None else known.pull,
+                None if known is None else known.precision,
             )
         )  # fmt: skip
 
@@ -371,11 +383,12 @@ class Start(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """An estimate, its chain and what the core found."""
+    """An estimate, its chain, what the core found and what it was told beforehand."""
 
     estimate: Estimate
     chain: Sites
     found: dict[str, Any]
+    known: Known | None
 
     @property
     def start(self) -> Start:

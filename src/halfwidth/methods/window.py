@@ -27,6 +27,7 @@ Pavelková and Kárný (2013), secs. 2, 5.1, 5.2. Rao, Rawlings and Mayne (2003)
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -74,6 +75,9 @@ class Window:
         Seen entries that a window holds of every output, by reaching further back where it must; at most memory + 1.
     stretch : int or None
         Most rows of a stretched window; None is no limit.
+    recall : float
+        For ``Posterior``: what rows that have left the window told of half-widths and of the state at its edge is
+        carried on; of half-widths it fades over `recall` times memory + 1 rows. 0 takes every window on its own.
 
     Notes
     -----
@@ -104,6 +108,7 @@ class Window:
     carry: float | None = None
     fixes: int = 10
     stretch: int | None = None
+    recall: float = 40.0
 
     def __post_init__(self) -> None:
         if isinstance(self.method, type) or not isinstance(self.method, Estimator) or isinstance(self.method, Window):
@@ -114,6 +119,8 @@ class Window:
             raise BadValue(f"`carry` is {self.carry!r}, a positive number or None was expected")
         if self.fixes < 0:
             raise BadValue(f"`fixes` is {self.fixes!r}, 0 or more was expected")
+        if not 0 <= self.recall < math.inf:
+            raise BadValue(f"`recall` is {self.recall!r}, a number of windows from 0 was expected")
         if self.stretch is not None and self.stretch < self.memory + 1:
             raise BadValue(f"`stretch` is {self.stretch!r}, at least memory + 1 = {self.memory + 1} was expected")
 

@@ -1,0 +1,227 @@
+"""What a window of `Posterior` hands on when rows leave it: knowledge of half-widths and of the state at its edge.
+
+Half-widths are constant or drift slowly, so what a row told of them stays true after the row has left. The evidence of
+window i is, about its posterior, a quadratic in u = s^(1/2),
+
+    log Z_i(u) ~ pull_i' u - u' H_i u / 2,    H_i = -Cov(g, u) Cov(u)^-1,    pull_i = E g + H_i E u,
+
+where g is the slope of log Z_i and the moments are those of the posterior over u (the nodes of `Posterior`). A row lies in as
+many windows as a window has rows, N: each window counts 1 / N, and only once **all** of its rows have left, so no row
+speaks twice and the prior of the newest window holds none of its own data. The sum of overlapping window likelihoods is a composite
+likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by exp(-1 / rows) a row.
+
+The state before the first row of a window is what the sites of the rows that have left make of it: the forwards message
+of expectation propagation, a Gaussian.
+
+References
+----------
+Varin, Reid and Firth (2011), An overview of composite likelihood methods, Statistica Sinica 21. Minka (2001), UAI.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.array import Array
+from halfwidth.methods._sites import Sites
+from halfwidth.spread import Normal
+
+if TYPE_CHECKING:
+    from halfwidth.methods.posterior import Answer
+
+#: Power of a half-width in which its posterior is nearly Gaussian: 0 is no tail there.
+WARP = 0.5
+
+
+class Known(NamedTuple):
+    """What is known of half-widths (q, r): the logarithm pull' u - u' precision u / 2 in u = s^(1/2)."""
+
+    pull: Array
+    precision: Array
+
+    @classmethod
+    def none(cls, p: int) -> "Known":
+        """Nothing is known of p half-widths."""
+        return cls(np.zeros(p), np.zeros((p, p)))
+
+    def plus(self, other: "Known", weight: float = 1.0) -> "Known":
+        """Add what other rows told."""
+        return Known(self.pull + weight * other.pull, self.precision + weight * other.precision)
+
+    def of(self, free: NDArray[np.bool_]) -> "Known":
+        """Return what is known of the free ones alone, whatever the others are, as a proper Gaussian."""
+        f, rest = np.flatnonzero(free), np.flatnonzero(~free)
+        H, h = self.precision[np.ix_(f, f)], self.pull[f]
+        if rest.size and self.precision[rest].any():
+            gain = self.precision[np.ix_(f, rest)] @ np.linalg.pinv(self.precision[np.ix_(rest, rest)], hermitian=True)
+            H, h = H - gain @ self.precision[np.ix_(rest, f)], h - gain @ self.pull[rest]
+        found = Known.none(len(free))
+        value, vector = np.linalg.eigh(H / (unit := _unit(H)) / unit[:, None])
+        keep = value > 0  # a direction that only curves the other way says nothing
+        basis = vector[:, keep] * unit[:, None]
+        found.precision[np.ix_(f, f)] = (basis * value[keep]) @ basis.T
+        found.pull[f] = basis @ (vector[:, keep].T @ (h / unit))
+        return found
+
+
+def _unit(H: Array) -> Array:
+    """Return a scale of each coordinate, so that eigenvalues compare."""
+    d = np.sqrt(np.abs(np.diagonal(H)))
+    return np.where(d > 0, d, 1.0)
+
+
+def told(answer: "Answer") -> Known:
+    """Return what the rows of one window tell of its half-widths."""
+    chain, found = answer.chain, answer.found
+    free = np.flatnonzero(chain.free)
+    q, K = free.size, int(found["nodes"])
+    known = Known.none(len(chain.free))
+    if not q:
+        return known
+    log_weight = found["log_weight"][:K]
+    phi, slope = found["phi"][:K, :q], found["slope"][:K, :q]
+    u = np.exp(WARP * phi)
+    g = slope / (WARP * u)
+    if K == 1:
+        H = found["H"][:q, :q] / (WARP**2 * u[0][:, None] * u[0])
+        if answer.known is not None:
+            H = H - answer.known.precision[np.ix_(free, free)]
+        pull = g[0] + H @ u[0]
+    else:
+        sound = np.isfinite(log_weight) & np.isfinite(g).all(axis=1)
+        u, g, log_weight = u[sound], g[sound], log_weight[sound]
+        if len(u) < q + 2:
+            return known
+        for flat in (1.0, 0.5, 0.25, 0.0):  # few nodes carry the weight: they alone cannot tell a slope
+            w = np.exp(flat * (log_weight - log_weight.max()))
+            w /= w.sum()
+            if 1.0 / (w @ w) > 2 * q + 2:
+                break
+        mean, level = w @ u, w @ g
+        du, dg = u - mean, g - level
+        S = (w[:, None] * du).T @ du
+        S[np.diag_indices(q)] *= 1.0 + 1e-6
+        H = -np.linalg.solve(S, (w[:, None] * du).T @ dg)
+        H = 0.5 * (H + H.T)
+        pull = level + H @ mean
+    if np.isfinite(H).all() and np.isfinite(pull).all():
+        known.precision[np.ix_(free, free)] = H
+        known.pull[free] = pull
+    return known
+
+
+def messages(chain: Sites, sites: tuple[Array, ...], stages: int) -> list[tuple[Array, Array]]:
+    """Return mean and covariance of x_0 .. x_stages given what lies up to each alone, by the sites of a solved chain."""
+    p = chain.problem
+    n = len(p["m0"])
+    m, D = (np.asarray(v).reshape(-1, n) for v in sites[:2])
+    tau, nu = (np.ravel(v) for v in sites[2:])
+
+    def at(name: str, t: int) -> Any:
+        stack = p.get(name)
+        if stack is None:
+            return None
+        index = p.get(f"{name}_index")
+        return stack[index[t] if index is not None else t if len(stack) > 1 else 0]
+
+    x, P = p["m0"] + m[0], p["P0"] + np.diag(D[0])
+    found = []
+    for t in range(stages + 1):
+        if t:
+            A, G, Q = at("A", t - 1), at("G", t - 1), at("Q", t - 1)
+            x = A @ x + p["b"][t - 1] + (m[t] if G is None else G @ m[t])
+            P = A @ P @ A.T + (np.diag(D[t]) if G is None else (G * D[t]) @ G.T)
+            if Q is not None:
+                P = P + Q
+        for k in range(int(p["start"][t]), int(p["start"][t + 1])):
+            h = p["h"][k]
+            Ph = P @ h
+            left = 1.0 + tau[k] * float(h @ Ph)
+            if left > 1e-9:
+                x = x + Ph * ((nu[k] - tau[k] * float(h @ x - p["y"][k])) / left)
+                P = P - np.outer(Ph, Ph) * (tau[k] / left)
+        found.append((x, 0.5 * (P + P.T)))
+    return found
+
+
+class Carried:
+    """What the windows of a stream hand on.
+
+    Parameters
+    ----------
+    p : int
+        Number of half-widths (q, r).
+    rows : float
+        Rows over which what is known of half-widths fades to 1 / e.
+
+    Attributes
+    ----------
+    s : (p,) array or None
+        Half-widths at the mode of the newest window.
+    """
+
+    def __init__(self, p: int, rows: float) -> None:
+        self.fade = math.exp(-1.0 / rows)
+        self.gone = Known.none(p)
+        self.waiting: list[tuple[int, Known]] = []  # newest row of a window, and what it told, weighted
+        self.s: Array | None = None
+        self.first: Normal | None = None  # the state before the first row, once rows have left
+        self._edge: list[tuple[Array, Array]] | None = None  # messages of the newest window's stages ...
+        self._newest: Answer | None = None  # ... or what they are made of
+
+    def known(self, first: int) -> Known | None:
+        """Return what the windows tell that have no row from `first` on, None where there is none."""
+        self.gone = Known(self.gone.pull * self.fade, self.gone.precision * self.fade)
+        while self.waiting and self.waiting[0][0] < first:
+            self.gone = self.gone.plus(self.waiting.pop(0)[1])
+        return self.gone if self.gone.precision.any() else None
+
+    def leave(self, a: int) -> None:
+        """Let go of the first a rows of the newest window: they tell the state that the next one begins at."""
+        self.first = self._state(a) if a else self.first
+
+    def _state(self, a: int) -> Normal | None:
+        if self._edge is None and self._newest is not None:
+            self._edge = messages(self._newest.chain, self._newest.found["sites"], a)
+        if self._edge is None or len(self._edge) <= a:
+            return None
+        x, P = self._edge[a]
+        d = np.diagonal(P)
+        if not (np.isfinite(x).all() and np.isfinite(P).all() and (d > 0).all()):
+            return None
+        return Normal(x, P + np.diag(1e-12 * d))
+
+    def take(self, answer: "Answer", newest: int, rows: int, *, counts: bool) -> None:
+        """Keep what a window told: its newest row's number, its number of rows, and whether it told anything new."""
+        self._edge, self._newest = None, None
+        if not answer.estimate.status.good:
+            return
+        self.s, self._newest = answer.start.s, answer
+        if counts:
+            self.waiting.append((newest, Known.none(len(self.s)).plus(told(answer), 1.0 / rows)))
+
+    def save(self) -> dict[str, Any]:
+        """Return all of it as plain numbers."""
+        edge = self._edge
+        if self._newest is not None:
+            stages = len(self._newest.chain.problem["start"]) - 2
+            edge = messages(self._newest.chain, self._newest.found["sites"], stages)
+        return {
+            "gone": [v.tolist() for v in self.gone],
+            "waiting": [[k, known.pull.tolist(), known.precision.tolist()] for k, known in self.waiting],
+            "s": None if self.s is None else self.s.tolist(),
+            "first": None if self.first is None else [self.first.mean.tolist(), self.first.P.tolist()],
+            "edge": None if edge is None else [[x.tolist(), P.tolist()] for x, P in edge],
+        }
+
+    def load(self, saved: dict[str, Any]) -> None:
+        """Take up what `save` returned."""
+        self.gone = Known(*(np.array(v, dtype=float) for v in saved["gone"]))
+        self.waiting = [(int(k), Known(np.array(h, dtype=float), np.array(H, dtype=float))) for k, h, H in saved["waiting"]]
+        self.s = None if saved["s"] is None else np.array(saved["s"], dtype=float)
+        first, edge = saved["first"], saved["edge"]
+        self.first = None if first is None else Normal(*first)
+        self._newest = None
+        self._edge = None if edge is None else [(np.array(x, dtype=float), np.array(P, dtype=float)) for x, P in edge]
