@@ -164,6 +164,9 @@ struct Ep {
     EpBlock block;
     EpState s;
     EpCross cross;
+    // A bound farther off than the root of `reach` standard deviations, or one that narrows its cavity's variance by a
+    // share below `faint`, says nothing at the precision that is asked for.
+    double reach = 72.0, faint = 1e-13;
 
     inline int packed() const { return n * (n + 1) / 2; }
     inline void unpack(const V* p, V* M) const {
@@ -347,10 +350,10 @@ struct Ep {
             fold<renew>(k, h, mf, Pf, f);
         }
     }
-    // both ends of a bound eight standard deviations off in every lane
+    // both ends of a bound out of reach in every lane
     inline bool far_inside(int k, const V& z, const V& v) const {
-        const X up = a.hi[k] - z.v, down = z.v - a.lo[k], reach = 64.0 * v.v + 1e-300;
-        return !any4((up < X{}) | (down < X{}) | (up * up < reach) | (down * down < reach) | (v.v != v.v));
+        const X up = a.hi[k] - z.v, down = z.v - a.lo[k], least = reach * v.v + 1e-300;
+        return !any4((up < X{}) | (down < X{}) | (up * up < least) | (down * down < least) | (v.v != v.v));
     }
 
     template <bool renew>
@@ -366,7 +369,8 @@ struct Ep {
             const Tilted<X> q = tilted<moments>(k, cavity);
             const V tv = larger(of(q.var), V(1e-300)), tm = of(q.mean), over = V(1.0) / tv;
             note(f, z, v, tm, tv, over, cavity);
-            const auto says = tv.v < c.v * (1.0 - 1e-12);  // else the factor widens the belief: nothing for now
+            // else the factor widens the belief: nothing for now
+            const auto says = tv.v < c.v * (1.0 - (kind(k) == ep_truncation ? faint : 1e-13));
             const V tau = either(says, over - w, V(0.0)), nu = either(says, tm * over - mu * w, V(0.0));
             V shift, shrink;
             if (kind(k) >= noise_contaminated && kind(k) != ep_truncation && damping < 1.0) {
@@ -835,6 +839,8 @@ struct Ep {
     // numbers are no longer finite or a factor lies thousands of standard deviations from where the others put it: no
     // trajectory fits, and its sites run away.
     int settle(EpFound& f, int sweeps, double tol, double damping) {
+        reach = min2(max2(2.0 * std::log(1e3 / max2(tol, 1e-300)), 20.0), 72.0);
+        faint = min2(max2(2e-3 * tol, 1e-13), 1e-4);
         for (int k = 1; k <= sweeps; k++) {
             sweep(f, damping);
             bool done = true;
