@@ -79,9 +79,7 @@ int run(N n, const EpArgs& a) {
                     s.nu[i].set(l, a.nu[k * a.rows + i]);
                 }
             }
-            ep.forget();
-            EpFound none = f;
-            ep.look(none);  // the message of the sites that were given
+            ep.hear();
         } else {
             ep.start();
         }

@@ -541,31 +541,48 @@ struct Ep {
             if (!renew && cross.S) covariances(t, A, G, W, Pp);
             if (t > 0 && a.G.data) turn(G, W, r);
             sites<renew>(t, W, r, f);
-            if (t == 0) break;
-            V Q[cap * cap], d[cap];
-            noise(t, G, Q, d);
-            ep_join(n, U, Q, W);
-            for (int i = 0; i < n; i++)
-                for (int j = 0; j < n; j++) eta[i] -= Lambda[i * n + j] * d[j];
-            less(W, Q, eta, r);
-            V WA[cap * cap];
-            for (int i = 0; i < n; i++)
-                for (int j = 0; j < n; j++) {
-                    V q(0.0);
-                    for (int k = 0; k < n; k++) q += W[i * n + k] * A[k * n + j];
-                    WA[i * n + j] = q;
-                }
-            V *eb = s.eb + (t - 1) * n, *Lb = s.Lb + (t - 1) * packed();
-            for (int i = 0; i < n; i++) {
+            if (t > 0) pass_on(t, A, G, Lambda, eta, U);
+        }
+    }
+
+    // Lambda, eta of t and the root U of Lambda become the message to t - 1
+    inline void pass_on(int t, const V* A, const V* G, const V* Lambda, V* eta, const V* U) {
+        V Q[cap * cap], d[cap], W[cap * cap], WA[cap * cap], r[cap];
+        noise(t, G, Q, d);
+        ep_join(n, U, Q, W);
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) eta[i] -= Lambda[i * n + j] * d[j];
+        less(W, Q, eta, r);
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
                 V q(0.0);
-                for (int k = 0; k < n; k++) q += A[k * n + i] * r[k];
-                eb[i] = q;
-                for (int j = 0; j <= i; j++) {
-                    V p(0.0);
-                    for (int k = 0; k < n; k++) p += A[k * n + i] * WA[k * n + j];
-                    Lb[tri(i, j)] = p;
-                }
+                for (int k = 0; k < n; k++) q += W[i * n + k] * A[k * n + j];
+                WA[i * n + j] = q;
             }
+        V *eb = s.eb + (t - 1) * n, *Lb = s.Lb + (t - 1) * packed();
+        for (int i = 0; i < n; i++) {
+            V q(0.0);
+            for (int k = 0; k < n; k++) q += A[k * n + i] * r[k];
+            eb[i] = q;
+            for (int j = 0; j <= i; j++) {
+                V p(0.0);
+                for (int k = 0; k < n; k++) p += A[k * n + i] * WA[k * n + j];
+                Lb[tri(i, j)] = p;
+            }
+        }
+    }
+
+    // the future's messages of the sites as they are
+    void hear() {
+        V A[cap * cap], G[cap * cap], Lambda[cap * cap], eta[cap], U[cap * cap];
+        for (int i = 0; i < n; i++) s.eb[a.T * n + i] = V(0.0);
+        for (int i = 0; i < packed(); i++) s.Lb[a.T * packed() + i] = V(0.0);
+        for (int t = a.T; t > 0; t--) {
+            block.loads(a.A, t - 1, n * n, A);
+            if (a.G.data) block.loads(a.G, t - 1, n * n, G);
+            ahead(t, Lambda, eta);
+            ep_root(n, Lambda, U);
+            pass_on(t, A, G, Lambda, eta, U);
         }
     }
 

@@ -110,7 +110,6 @@ struct EpLearner {
     double* lead = nullptr;
     double kept[ep_free] = {};      // parameters of the sites that are kept
     bool followed[ep_free] = {};    // lead was measured; else sites keep their shape over their own half-width
-    bool dirty = false;             // the message may hold what is not finite
 
     int group_of(std::ptrdiff_t site) const {
         const std::ptrdiff_t k = site - stage_count();
@@ -195,8 +194,7 @@ struct EpLearner {
                 ep.s.nu[k] = ep.s.tau[k] * mean;
             }
         }
-        if (dirty) ep.forget();
-        dirty = false;
+        ep.hear();
     }
 
     // evaluate the lanes; value[l] = log posterior up to a constant, slope[l][j]
@@ -206,7 +204,6 @@ struct EpLearner {
         sweeps++;
         for (int l = 0; l < wide_lanes; l++) {
             const bool sound = ep.sound(f, l);
-            if (!sound) dirty = true;
             value[l] = sound ? f.log_z[l] + log_prior(phi[l], l) : minus_inf;
             for (int j = 0; j < q; j++)
                 slope[l][j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l] + prior_slope(j, phi[l], l);
@@ -310,7 +307,6 @@ struct EpLearner {
                 refused++;
                 if (*best == minus_inf) {  // the start itself: wider half-widths fit more
                     for (int j = 0; j < q; j++) phi[j] = min2(max2(phi[j] + (group[j] >= 0 ? 0.7 : 0.0), lo[j]), hi[j]);
-                    dirty = false;
                     warm = false;
                     k = -1;
                     if (refused == 6) return 2;
@@ -420,7 +416,6 @@ struct EpLearner {
             }
             for (int j = 0; j < q; j++) from[j] = group[j] >= 0 ? std::log(max2(a.was[group[j]], 1e-300)) : phi[j];
             keep(from);
-            ep.forget();
         }
         const EpCross wanted = ep.cross;
         ep.cross = EpCross{};
