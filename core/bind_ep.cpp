@@ -203,9 +203,10 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
     a.used = used.data();
     {
         nb::gil_scoped_release release;
-        Work work(HW_PICK_WIDE(ep_workspace)(a));
+        const bool few = 2 * members <= hw::ep_abreast;  // narrow registers answer sooner
+        Work work((few ? HW_PICK(ep_workspace) : HW_PICK_WIDE(ep_workspace))(a));
         a.work = work.p;
-        HW_PICK_WIDE(ep_run)(a);
+        (few ? HW_PICK(ep_run) : HW_PICK_WIDE(ep_run))(a);
     }
     nb::list count;
     for (std::int32_t u : used) count.append(u);

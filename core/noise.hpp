@@ -190,7 +190,7 @@ inline Truncated<X> cut4(const Cavity<X>& from, X lo, X hi) {
         mean = narrow ? end + sign * width * (0.5 + s1) : mean;
         var = narrow ? w2 * own : var;
         if (depth >= evidence) {
-            density = narrow ? S[0] * exp4(0.5 * (ref - m) * (ref + m)) : density;
+            density = narrow ? S[0] * exp4(beyond ? -0.5 * w * (a + 0.25 * w) : -0.5 * m * m) : density;
             Z = narrow ? w * density : Z;
         }
         if (depth == cumulants) {

@@ -31,7 +31,7 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
-from halfwidth.methods._carry import WARP, Known
+from halfwidth.methods._carry import WARP, Known, Warm
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Sites, gaussian_part, sites, uniform_part
 from halfwidth.model import Linear, Model, Nonlinear
@@ -52,6 +52,8 @@ _LIMITS = {
 _LONG = 2000
 _FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
+#: The mode of the window before is a good centre of nodes up to this distance, in standard deviations.
+_NEAR = 0.8
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
@@ -207,25 +209,39 @@ class Posterior:
             return with_entries(self, model, record)
         return self.answer(model, record).estimate
 
-    def resumed(self, model: Model, record: Record, s: Array | None, known: Known | None) -> "Answer":
-        """Return the answer of one window of a stream; `s` is where to start, `known` what earlier rows told."""
+    def resumed(
+        self, model: Model, record: Record, s: Array | None, known: Known | None, warm: tuple[Warm, int] | None = None
+    ) -> "Answer":
+        """Return the answer of one window of a stream.
+
+        `s` is where to start, `known` what earlier rows told, `warm` the sites of the window before and how many rows
+        later this one begins.
+        """
         if isinstance(model, Nonlinear):
             from halfwidth.methods._relinearise import relinearised
 
             return relinearised(self, model, record, s=s, known=known)
-        return self.answer(model, record, start=s, known=known)
+        return self.answer(model, record, start=s, known=known, warm=warm)
 
     def answer(
-        self, model: Linear, record: Record, *, start: "Start | Array | None" = None, known: Known | None = None
+        self,
+        model: Linear,
+        record: Record,
+        *,
+        start: "Start | Array | None" = None,
+        known: Known | None = None,
+        warm: tuple[Warm, int] | None = None,
     ) -> "Answer":
         """Return the estimate of a model without unknown entries, and what the next one may start from.
 
         `start` holds half-widths (p,), with the sites that belong to them if the chain has the same shape; `known` is
-        what other rows told of half-widths.
+        what other rows told of half-widths; `warm` as in `resumed`.
         """
         if isinstance(start, np.ndarray):
             start = Start(start, None)
         problem = sites(model, record, outliers=self.outliers is not False and self.outliers != 0)
+        if warm is not None and problem.free.any():
+            start = Start(warm[0].s, warm[0].moved(problem, warm[1]))
         if start is None and len(record) > 2 * _FIRST and problem.free.any():
             # The first rows alone say where to look.
             cut = {k: v.value[:_FIRST] for k, v in model.matrices.items() if v.value is not None and v.value.ndim == 3}
@@ -261,6 +277,8 @@ class Posterior:
             limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
             limits |= _MIXED
+        if sites_ is not None:
+            limits["close"] = _NEAR
         if chain.exact:
             limits["most"] = 1
         return dict(
