@@ -49,7 +49,7 @@ def table():
         print(
             f"  a sweep of 26 stages, n = 3, {members} chain(s) side by side   {one * 1e6:8.1f} us   {one / members * 1e6:6.1f} us a chain"
         )
-    for nodes in (hw.Posterior().nodes, 64, 16):
+    for nodes in (64, 32, 16):
         method = hw.Posterior(nodes=nodes)
         print(
             f"  a window of 26 rows from cold, {nodes} nodes          {spent(lambda m=method: hw.estimate(model, window, m), 15) * 1e3:8.2f} ms"
@@ -74,7 +74,6 @@ def table():
     print(
         f"  T = 36,000, n = 4, with learning                  {time.process_time() - start:8.2f} s   q {est.q.round(3)} r {est.r.round(3)}"
     )
-
 
 
 def off(x, truth, sd):

@@ -116,6 +116,11 @@ struct EpLearner {
         if (k < 0) return site < ep.n ? -1 : a.base.group_w[site % ep.n];
         return a.base.kind[k] == noise_gaussian || a.base.kind[k] == ep_truncation ? -1 : a.base.group[k];
     }
+    // a row with two explanations may change between them: its site is not led along
+    bool steady(std::ptrdiff_t site) const {
+        const std::ptrdiff_t k = site - stage_count();
+        return k < 0 || a.base.kind[k] < noise_contaminated || a.base.kind[k] == ep_truncation;
+    }
     // keep the sites of lane l, which belong to phi
     void remember(int l, const double* phi) {
         for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
@@ -132,8 +137,8 @@ struct EpLearner {
         const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
         for (int j = 0; j < q; j++) {
             kept[j] = phi[j];
-            if (followed[j]) continue;
             for (std::ptrdiff_t site = 0; site < sites; site++) {
+                if (followed[j] && steady(site)) continue;
                 const bool own = group[j] >= 0 && group_of(site) == group[j];
                 const std::ptrdiff_t k = site - stages;
                 const double mean = k < 0 ? keep_m[site] : keep_tau[k] > 0.0 ? keep_nu[k] / keep_tau[k] : 0.0;
@@ -154,6 +159,7 @@ struct EpLearner {
                 lane[count++] = l;
             }
         for (std::ptrdiff_t site = 0; site < sites; site++) {
+            if (!steady(site)) continue;
             const std::ptrdiff_t k = site - stages;
             const V own = k < 0 ? ep.s.D[site] : ep.s.tau[k];
             V turn(0.0), move(0.0);

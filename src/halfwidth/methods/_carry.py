@@ -260,7 +260,9 @@ class Carried:
     def load(self, saved: dict[str, Any]) -> None:
         """Take up what `save` returned."""
         self.gone = Known(*(np.array(v, dtype=float) for v in saved["gone"]))
-        self.waiting = [(int(k), Known(np.array(h, dtype=float), np.array(H, dtype=float))) for k, h, H in saved["waiting"]]
+        self.waiting = [
+            (int(k), Known(np.array(h, dtype=float), np.array(H, dtype=float))) for k, h, H in saved["waiting"]
+        ]
         self.s = None if saved["s"] is None else np.array(saved["s"], dtype=float)
         self.warm = None
         if saved["warm"] is not None and self.s is not None:

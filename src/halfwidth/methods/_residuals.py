@@ -19,8 +19,8 @@ Pavelková (2011), ÚTIA report 2296, eqs. (7), (8), (14), (18); Pavelková and 
 Redundancy and variance components: Förstner (1979), Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten.
 """
 
-from collections.abc import Sequence
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -258,7 +258,9 @@ def first_scales(model: Linear, seen: Sequence[Array]) -> Array:
         return one if one.ndim == 2 else one.mean(axis=0)
 
     C = np.ascontiguousarray(typical(model.C, nx), dtype=float)
-    felt = _felt(nx, *(np.ascontiguousarray(typical(v, nx), dtype=float).tobytes() for v in (model.E, model.A)), C.tobytes())
+    felt = _felt(
+        nx, *(np.ascontiguousarray(typical(v, nx), dtype=float).tobytes() for v in (model.E, model.A)), C.tobytes()
+    )
     weight = np.array([1.0 / s**2 if len(y) else 0.0 for s, y in zip(sigma[nx:], seen, strict=True)])
     gram = weight @ felt
     sigma[:nx][gram > 0] = 1.0 / np.sqrt(gram[gram > 0])

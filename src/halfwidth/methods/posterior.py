@@ -57,7 +57,7 @@ _NEAR = 0.8
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
-_MIXED = {"most": 12, "damping": 0.5}
+_MIXED = {"few": 3, "many": 6, "most": 20, "damping": 0.5}
 #: Moments that agree this well, in standard deviations, are good, and good enough to be used.
 _FINE, _USABLE = 0.01, 0.1
 #: Fewer effective nodes than this leave an integral over half-widths rough.
@@ -118,7 +118,7 @@ class Posterior:
     """
 
     method: Literal["ep", "sample"] = "ep"
-    nodes: int = 32
+    nodes: int = 64
     outliers: float | bool = False
     rounds: int = 20
     iterations: int = 200
