@@ -574,7 +574,7 @@ struct Ep {
 
     // the future's messages of the sites as they are
     void hear() {
-        V A[cap * cap], G[cap * cap], Lambda[cap * cap], eta[cap], U[cap * cap];
+        V A[cap * cap], G[cap * cap] = {}, Lambda[cap * cap], eta[cap], U[cap * cap];
         for (int i = 0; i < n; i++) s.eb[a.T * n + i] = V(0.0);
         for (int i = 0; i < packed(); i++) s.Lb[a.T * packed() + i] = V(0.0);
         for (int t = a.T; t > 0; t--) {

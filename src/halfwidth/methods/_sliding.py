@@ -244,7 +244,8 @@ class Sliding:
     def _posterior(self, model: Model, part: Record, a: int) -> Estimate:
         """Estimate one window with what the rows before it told."""
         held, method = self.carried, self.window.method
-        assert held is not None and isinstance(method, Posterior)
+        assert held is not None
+        assert isinstance(method, Posterior)
         seen = part.seen.any(axis=1)
         warm = None if held.warm is None else (held.warm, a)
         answer = method.resumed(model, part, held.s, held.known(self.first + a), warm)
@@ -487,11 +488,10 @@ def window_lasts(
     """
     T, ny = seen.shape
     rows = np.arange(T)
-    if seen.all() and used is None:
-        return np.arange(memory - 1, T + memory, dtype=np.int32)
-    if seen.all() and edge is not None:
+    if seen.all():
         last = np.arange(memory - 1, T + memory, dtype=np.int32)
-        last[0] += bool((used & ~edge).any())
+        if used is not None and edge is not None:
+            last[0] += bool((used & ~edge).any())
         return last
     end, first = rows.copy(), -1
     for j in range(ny):
