@@ -358,10 +358,11 @@ struct Ep {
 
     template <bool renew>
     inline void renew_row(int k, const V& z, V v, const V* Ph, V* ms, V* Ps, EpFound& f, double damping) {
-        const auto known = v.v < all<X>(1e-290);  // nothing left to learn
+        // the cavity; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
+        const V left = V(1.0) - s.tau[k] * v, open = larger(left, V(1e-9)), over_open = V(1.0) / open;
+        const auto known = (v.v < all<X>(1e-290)) | (left.v < all<X>(1e-9));  // the belief stays as it is
         v = larger(v, V(1e-300));
-        // the cavity; a site that claims more than the belief has is a bad one and is taken as nothing
-        const V over_v = V(1.0) / v, open = larger(V(1.0) - s.tau[k] * v, V(1e-9)), over_open = V(1.0) / open;
+        const V over_v = V(1.0) / v;
         const V c = smaller(v * over_open, V(1e300)), mu = (z - v * s.nu[k]) * over_open, w = open * over_v;
         const V scale = root(w);
         const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};

@@ -246,7 +246,7 @@ class Sliding:
         held, method = self.carried, self.window.method
         assert held is not None
         assert isinstance(method, Posterior)
-        seen = part.seen.any(axis=1)
+        seen = np.asarray(part.seen.any(axis=1))
         warm = None if held.warm is None else (held.warm, a)
         answer = method.resumed(model, part, held.s, held.known(self.first + a), warm)
         newest = self.first + len(self.times) - 1
