@@ -85,7 +85,7 @@ inline void ep_join(N n, const V* L, const V* M, V* out) {
             S[i * n + j] = s;
         }
     for (int j = 0; j < n; j++) {  // S = unit lower factor below the diagonal, 1 / pivot on it
-        const V over = V(1.0) / S[j * n + j];
+        const V over = either(S[j * n + j].v > X{}, V(1.0) / S[j * n + j], V(0.0));  // lost to rounding: left out
         for (int i = j + 1; i < n; i++) {
             const V share = S[i * n + j] * over;
             for (int k = j + 1; k <= i; k++) S[i * n + k] -= share * S[k * n + j];
