@@ -38,7 +38,7 @@ def table():
     window = hw.Record(record.t[:26], record.y[:26], record.u[:26])
     model = study.system(unknown, unknown)
     chain = sites(study.system(hw.Uniform(study.Q), hw.Uniform(study.R)), window)
-    s = np.tile(np.r_[np.full(3, study.Q), np.full(2, study.R)], (4, 1))
+    s = np.tile(np.r_[np.full(3, study.Q), np.full(2, study.R)], (8, 1))
 
     def sweeps(count, members):
         return lambda: _core.ep_run(chain.problem, s[:members], np.zeros(members), count, 0.0, 1.0, None)
