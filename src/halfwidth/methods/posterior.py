@@ -44,7 +44,7 @@ _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
 POWER = 0.85
 _LIMITS = {
-    "steps": 14, "few": 2, "many": 4, "most": 3, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.35, "least": 0.3,
+    "steps": 14, "few": 2, "many": 4, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.25, "least": 0.3,
     "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
 }  # fmt: skip
 #: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
