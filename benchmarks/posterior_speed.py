@@ -38,7 +38,7 @@ def table():
     window = hw.Record(record.t[:26], record.y[:26], record.u[:26])
     model = study.system(unknown, unknown)
     chain = sites(study.system(hw.Uniform(study.Q), hw.Uniform(study.R)), window)
-    s = np.tile(np.r_[np.full(3, study.Q), np.full(2, study.R)], (4, 1))
+    s = np.tile(np.r_[np.full(3, study.Q), np.full(2, study.R)], (8, 1))
 
     def sweeps(count, members):
         return lambda: _core.ep_run(chain.problem, s[:members], np.zeros(members), count, 0.0, 1.0, None)
@@ -49,7 +49,7 @@ def table():
         print(
             f"  a sweep of 26 stages, n = 3, {members} chain(s) side by side   {one * 1e6:8.1f} us   {one / members * 1e6:6.1f} us a chain"
         )
-    for nodes in (hw.Posterior().nodes, 64, 16):
+    for nodes in (64, 32, 16):
         method = hw.Posterior(nodes=nodes)
         print(
             f"  a window of 26 rows from cold, {nodes} nodes          {spent(lambda m=method: hw.estimate(model, window, m), 15) * 1e3:8.2f} ms"

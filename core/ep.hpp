@@ -21,9 +21,7 @@
 // Evidence: log Z = sum over sites of (log Z_k - log of the site's integral under its cavity) + the Gaussian's own; at a
 // fixed point its derivative in a parameter of f_k is that of log Z_k alone.
 //
-// Members (same rows, other half-widths or matrices) run side by side, one a lane. What limits a sweep is the chain of
-// dependent operations from site to site: what a site becomes is written down beside it, and the belief is handed on
-// through the moments that the site was asked for, by which time the next one can begin.
+// Members (same rows, other half-widths or matrices) run side by side, one a lane.
 #pragma once
 
 #include "chain.hpp"
@@ -87,7 +85,7 @@ inline void ep_join(N n, const V* L, const V* M, V* out) {
             S[i * n + j] = s;
         }
     for (int j = 0; j < n; j++) {  // S = unit lower factor below the diagonal, 1 / pivot on it
-        const V over = V(1.0) / S[j * n + j];
+        const V over = either(S[j * n + j].v > X{}, V(1.0) / S[j * n + j], V(0.0));  // lost to rounding: left out
         for (int i = j + 1; i < n; i++) {
             const V share = S[i * n + j] * over;
             for (int k = j + 1; k <= i; k++) S[i * n + k] -= share * S[k * n + j];
@@ -358,10 +356,10 @@ struct Ep {
 
     template <bool renew>
     inline void renew_row(int k, const V& z, V v, const V* Ph, V* ms, V* Ps, EpFound& f, double damping) {
-        const auto known = v.v < all<X>(1e-290);  // nothing left to learn
+        // the cavity; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
+        const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9)), over_open = V(1.0) / open;
         v = larger(v, V(1e-300));
-        // the cavity; a site that claims more than the belief has is a bad one and is taken as nothing
-        const V over_v = V(1.0) / v, open = larger(V(1.0) - s.tau[k] * v, V(1e-9)), over_open = V(1.0) / open;
+        const V over_v = V(1.0) / v;
         const V c = smaller(v * over_open, V(1e300)), mu = (z - v * s.nu[k]) * over_open, w = open * over_v;
         const V scale = root(w);
         const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};
@@ -372,22 +370,13 @@ struct Ep {
             // else the factor widens the belief: nothing for now
             const auto says = tv.v < c.v * (1.0 - (kind(k) == ep_truncation ? faint : 1e-13));
             const V tau = either(says, over - w, V(0.0)), nu = either(says, tm * over - mu * w, V(0.0));
-            V shift, shrink;
-            if (kind(k) >= noise_contaminated && kind(k) != ep_truncation && damping < 1.0) {
-                const V dt = V(damping) * (tau - s.tau[k]), dn = V(damping) * (nu - s.nu[k]);
-                const V gain = V(1.0) / larger(V(1.0) + dt * v, V(1e-12));
-                s.tau[k] += dt;
-                s.nu[k] += dn;
-                shift = (dn - dt * z) * gain;
-                shrink = dt * gain;
-            } else {  // the belief takes the moments that were asked for
-                shift = (either(says, tm, mu) - z) * over_v;
-                shrink = (V(1.0) - either(says, tv, c) * over_v) * over_v;
-                s.tau[k] = tau;
-                s.nu[k] = nu;
-            }
-            shift = either(known, V(0.0), shift);
-            shrink = either(known, V(0.0), shrink);
+            // by what the site changes: a site that stays leaves the belief as it is, whatever rounding made of v
+            const V step(kind(k) >= noise_contaminated && kind(k) != ep_truncation ? damping : 1.0);
+            const V dt = step * (tau - s.tau[k]), dn = step * (nu - s.nu[k]);
+            const V gain = V(1.0) / larger(V(1.0) + dt * v, V(1e-12));
+            s.tau[k] += dt;
+            s.nu[k] += dn;
+            const V shift = (dn - dt * z) * gain, shrink = dt * gain;
             for (int i = 0; i < n; i++) {
                 ms[i] += Ph[i] * shift;
                 const V g = Ph[i] * shrink;
@@ -574,7 +563,7 @@ struct Ep {
 
     // the future's messages of the sites as they are
     void hear() {
-        V A[cap * cap], G[cap * cap], Lambda[cap * cap], eta[cap], U[cap * cap];
+        V A[cap * cap], G[cap * cap] = {}, Lambda[cap * cap], eta[cap], U[cap * cap];
         for (int i = 0; i < n; i++) s.eb[a.T * n + i] = V(0.0);
         for (int i = 0; i < packed(); i++) s.Lb[a.T * packed() + i] = V(0.0);
         for (int t = a.T; t > 0; t--) {
@@ -794,8 +783,9 @@ struct Ep {
                 const V tv = of(q.var), tm = of(q.mean);
                 note(f, mean, var, tm, larger(tv, V(1e-300)), V(1.0) / larger(tv, V(1e-300)), cavity);
                 const V rest = larger(V(1.0) - tv * w, V(1e-6));  // 1 - tilted variance over the cavity's
-                // what the rest knows of w_i once its site is renewed: rest / c, (mu - mean) / c
-                const V shift = (r[i] - (mu - tm) * w) * over_know, shrink = (V(1.0) - rest * w * over_know) * over_know;
+                const V over = V(1.0) / rest, dD = tv * over - D[i], dm = mu + (tm - mu) * over - m[i];
+                const V gain = V(1.0) / larger(V(1.0) + dD * W[i * n + i], V(1e-12));
+                const V shift = (r[i] * dD + dm) * gain, shrink = dD * gain;
                 V column[cap];
                 for (int j = 0; j < n; j++) column[j] = W[j * n + i];
                 for (int j = 0; j < n; j++) {
@@ -803,9 +793,8 @@ struct Ep {
                     const V g = column[j] * shrink;
                     for (int k = 0; k < n; k++) W[j * n + k] -= g * column[k];
                 }
-                const V over = V(1.0) / rest;
-                D[i] = tv * over;
-                m[i] = mu + (tm - mu) * over;
+                D[i] += dD;
+                m[i] += dm;
             } else {
                 const Tilted<X> q = cross.S ? uniform4<cumulants>(cavity, half.v) : uniform4<evidence>(cavity, half.v);
                 const V tv = larger(of(q.var), V(1e-300));

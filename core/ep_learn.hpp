@@ -23,6 +23,7 @@ namespace HW_ISA {
 
 constexpr int ep_free = 16;   // most free parameters
 constexpr int ep_alone = 10;  // sweeps of a chain with its bounds alone, which starts afresh
+constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
 template <class N>
 struct EpLearner {
@@ -125,6 +126,11 @@ struct EpLearner {
         if (k < 0) return site < ep.n ? -1 : a.base.group_w[site % ep.n];
         return a.base.kind[k] == noise_gaussian || a.base.kind[k] == ep_truncation ? -1 : a.base.group[k];
     }
+    // a row with two explanations may change between them: its site is not led along
+    bool steady(std::ptrdiff_t site) const {
+        const std::ptrdiff_t k = site - stage_count();
+        return k < 0 || a.base.kind[k] < noise_contaminated || a.base.kind[k] == ep_truncation;
+    }
     // keep the sites of lane l, which belong to phi
     void remember(int l, const double* phi) {
         for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
@@ -141,8 +147,8 @@ struct EpLearner {
         const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
         for (int j = 0; j < q; j++) {
             kept[j] = phi[j];
-            if (followed[j]) continue;
             for (std::ptrdiff_t site = 0; site < sites; site++) {
+                if (followed[j] && steady(site)) continue;
                 const bool own = group[j] >= 0 && group_of(site) == group[j];
                 const std::ptrdiff_t k = site - stages;
                 const double mean = k < 0 ? keep_m[site] : keep_tau[k] > 0.0 ? keep_nu[k] / keep_tau[k] : 0.0;
@@ -163,6 +169,7 @@ struct EpLearner {
                 lane[count++] = l;
             }
         for (std::ptrdiff_t site = 0; site < sites; site++) {
+            if (!steady(site)) continue;
             const std::ptrdiff_t k = site - stages;
             const V own = k < 0 ? ep.s.D[site] : ep.s.tau[k];
             V turn(0.0), move(0.0);
@@ -299,6 +306,13 @@ struct EpLearner {
         return far;
     }
 
+    // little is left to be known of the parameters, or no more is asked for: one node does
+    bool alone(const double (*H)[ep_free]) const {
+        double wide = 0.0;
+        for (int j = 0; j < q; j++) wide = max2(wide, 1.0 / std::sqrt(H[j][j]));
+        return q == 0 || wide < a.narrow || a.nodes == 1;
+    }
+
     // climb from phi to the mode; H at the end; returns 0, 1: not converged, 2: no sound point
     int climb(double* phi, double (*H)[ep_free], double* best, bool warm) {
         double column[ep_free][ep_free] = {}, g[ep_free] = {};
@@ -364,7 +378,7 @@ struct EpLearner {
             follow(along, h, value);
             hessian(column, H);
             length = step(H, phi, g, d);
-            if (length < a.close && missing == 0) return 0;
+            if (length < (alone(H) ? min2(a.close, ep_near) : a.close) && missing == 0) return 0;
         }
         return length < 1.0 ? 0 : 1;
     }
@@ -480,10 +494,7 @@ struct EpLearner {
             b.tau[k] = keep_tau[k];
             b.nu[k] = keep_nu[k];
         }
-        // Little is left to be known of the parameters: one node does.
-        double wide = 0.0;
-        for (int j = 0; j < q; j++) wide = max2(wide, 1.0 / std::sqrt(H[j][j]));
-        const int nodes = q == 0 || wide < a.narrow ? 1 : a.nodes;
+        const int nodes = alone(H) ? 1 : a.nodes;
         *a.used = nodes;
         ep.cross = wanted;
         const std::ptrdiff_t size = stage_count();

@@ -269,7 +269,7 @@ def first_scales(model: Linear, seen: Sequence[Array]) -> Array:
 
 @functools.lru_cache(maxsize=256)
 def _felt(nx: int, E: bytes, A: bytes, C: bytes) -> Array:
-    """Return the sum of squares (ny, nx) over the next rows of what a unit disturbance of each state does to each output."""
+    """Return what a unit disturbance of each state does to each output: sums of squares over later rows, (ny, nx)."""
     inverse = np.linalg.inv(np.frombuffer(E).reshape(nx, nx))
     Phi = inverse @ np.frombuffer(A).reshape(nx, nx)
     H = np.frombuffer(C).reshape(-1, nx)

@@ -252,7 +252,7 @@ class Sliding:
         held, method = self.carried, self.window.method
         assert held is not None
         assert isinstance(method, Posterior)
-        seen = np.atleast_1d(part.seen.any(axis=1))
+        seen = np.asarray(part.seen.any(axis=1))
         warm = None if held.warm is None else (held.warm, a)
         answer = method.resumed(model, part, held.s, held.known(self.first + a), warm)
         newest = self.first + len(self.times) - 1
@@ -496,11 +496,10 @@ def window_lasts(
     """
     T, ny = seen.shape
     rows = np.arange(T)
-    if seen.all() and used is None:
-        return np.arange(memory - 1, T + memory, dtype=np.int32)
-    if seen.all() and edge is not None:
+    if seen.all():
         last = np.arange(memory - 1, T + memory, dtype=np.int32)
-        last[0] += bool((used & ~edge).any())
+        if used is not None and edge is not None:
+            last[0] += bool((used & ~edge).any())
         return last
     end, first = rows.copy(), -1
     for j in range(ny):

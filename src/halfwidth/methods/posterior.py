@@ -46,7 +46,7 @@ _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
 POWER = 0.85
 _LIMITS = {
-    "steps": 14, "few": 2, "many": 4, "most": 3, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.35, "least": 0.3,
+    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "least": 0.3,
     "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
 }  # fmt: skip
 #: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone
@@ -62,7 +62,7 @@ _NEAR = 0.8
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
-_MIXED = {"most": 12, "damping": 0.5}
+_MIXED = {"most": 20, "damping": 0.5}
 #: Moments that agree this well, in standard deviations, are good, and good enough to be used.
 _FINE, _USABLE = 0.01, 0.1
 #: Fewer effective nodes than this leave an integral over half-widths rough.
@@ -124,7 +124,7 @@ class Posterior:
     """
 
     method: Literal["ep", "sample"] = "ep"
-    nodes: int = 32
+    nodes: int = 64
     outliers: float | bool = False
     rounds: int = 20
     iterations: int = 200
