@@ -1,4 +1,8 @@
-"""Speed of `Posterior`: a sweep, a window from cold, a push of a stream, a long record with learning."""
+"""Speed of `Posterior`: a sweep, a window from cold, a push of a stream, a long record, and error against CPU time
+beside the sampler.
+
+    python benchmarks/posterior_speed.py [table] [sampler]
+"""
 
 import os
 import sys
@@ -11,6 +15,7 @@ import numpy as np  # noqa: E402
 
 import halfwidth as hw  # noqa: E402
 from halfwidth import _core  # noqa: E402
+from halfwidth.methods import posterior as engine  # noqa: E402
 from halfwidth.methods._sites import sites  # noqa: E402
 
 
@@ -24,9 +29,8 @@ def spent(call, repeats):
     return least
 
 
-def main():
-    """Print the table."""
-    sys.path.insert(0, os.path.dirname(__file__))
+def table():
+    """Print what each piece costs."""
     import posterior as study
 
     unknown = hw.Uniform.unknown(at_most=1.0)
@@ -34,13 +38,13 @@ def main():
     window = hw.Record(record.t[:26], record.y[:26], record.u[:26])
     model = study.system(unknown, unknown)
     chain = sites(study.system(hw.Uniform(study.Q), hw.Uniform(study.R)), window)
-    s = np.tile(np.r_[np.full(3, study.Q), np.full(2, study.R)], (4, 1))
+    s = np.tile(np.r_[np.full(3, study.Q), np.full(2, study.R)], (8, 1))
 
     def sweeps(count, members):
         return lambda: _core.ep_run(chain.problem, s[:members], np.zeros(members), count, 0.0, 1.0, None)
 
     print("Posterior: CPU time")
-    for members in (1, 4):
+    for members in (1, 4, 8):
         one = (spent(sweeps(220, members), 15) - spent(sweeps(20, members), 15)) / 200
         print(
             f"  a sweep of 26 stages, n = 3, {members} chain(s) side by side   {one * 1e6:8.1f} us   {one / members * 1e6:6.1f} us a chain"
@@ -70,6 +74,70 @@ def main():
     print(
         f"  T = 36,000, n = 4, with learning                  {time.process_time() - start:8.2f} s   q {est.q.round(3)} r {est.r.round(3)}"
     )
+
+
+def off(x, truth, sd):
+    """Root mean square distance of posterior means, in posterior standard deviations."""
+    return float(np.sqrt(np.mean(((x - truth) / sd) ** 2)))
+
+
+def sampler(windows=3, draws=(50, 200, 800), long=5_000):
+    """Print the error of posterior means against CPU time, for expectation propagation and for draws.
+
+    Truth is a long run of the sampler. Half-widths that are learned have the sampler's prior in both, the power alone.
+    The error of draws falls with the root of their number, so the time to reach a given error follows from a run of any
+    length; that of expectation propagation is its own bias.
+    """
+    import posterior as study
+
+    def mean_sd(est):
+        points = np.moveaxis(est.spread.points, 1, 0)
+        return points.mean(axis=0), points.std(axis=0)
+
+    unknown = hw.Uniform.unknown(at_most=1.0)
+    models = {
+        "half-widths told": study.system(hw.Uniform(study.Q), hw.Uniform(study.R)),
+        "half-widths learned": study.system(unknown, unknown),
+    }
+    parts = [part for _, _, part in study.windows(25, windows, 11)]
+    kept = engine._LIMITS["reference"]
+    engine._LIMITS["reference"] = 0.0
+    print(f"error of posterior means, in posterior sd, {windows} windows of 26 rows; truth: 4 chains of {long} draws")
+    for name, model in models.items():
+        rows = {count: [] for count in draws}
+        ours, agree = [], []
+        for part in parts:
+            true = hw.estimate(model, part, hw.Posterior(method="sample", draws=long), seed=1)
+            truth, sd = mean_sd(true)
+            agree.append(true.info["rhat"])
+            hw.estimate(model, part, hw.Posterior())
+            start = time.process_time()
+            est = hw.estimate(model, part, hw.Posterior())
+            ours.append((off(est.x, truth, sd), time.process_time() - start))
+            for count in draws:
+                start = time.process_time()
+                est = hw.estimate(model, part, hw.Posterior(method="sample", draws=count), seed=2)
+                rows[count].append((off(mean_sd(est)[0], truth, sd), time.process_time() - start))
+        mine, cost = np.sqrt(np.mean(np.square([o[0] for o in ours]))), np.median([o[1] for o in ours])
+        print(f"  {name}: R-hat of the truth {max(agree):.3f}")
+        print(f"    expectation propagation        error {mine:.4f}  {1e3 * cost:9.2f} ms")
+        for count in draws:
+            error = np.sqrt(np.mean(np.square([r[0] for r in rows[count]])))
+            seconds = np.median([r[1] for r in rows[count]])
+            needed = seconds * (error / mine) ** 2
+            print(
+                f"    sampler, 4 chains of {count:5d}      error {error:.4f}  {1e3 * seconds:9.2f} ms; "
+                f"to the same error {1e3 * needed:9.1f} ms: {needed / cost:6.0f} times"
+            )
+    engine._LIMITS["reference"] = kept
+
+
+def main():
+    """Run what is asked for."""
+    sys.path.insert(0, os.path.dirname(__file__))
+    names = [name for name in sys.argv[1:] if name in ("table", "sampler")]
+    for name in names or ["table", "sampler"]:
+        {"table": table, "sampler": sampler}[name]()
 
 
 if __name__ == "__main__":

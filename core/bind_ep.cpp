@@ -38,8 +38,8 @@ nb::object fresh(std::vector<std::size_t> shape, double** p, const double* from 
 
 struct Work {
     explicit Work(std::size_t size)
-        : p(static_cast<double*>(::operator new((size + 4) * sizeof(double), std::align_val_t(32)))) {}
-    ~Work() { ::operator delete(p, std::align_val_t(32)); }
+        : p(static_cast<double*>(::operator new((size + hw::ep_abreast) * sizeof(double), std::align_val_t(64)))) {}
+    ~Work() { ::operator delete(p, std::align_val_t(64)); }
     Work(const Work&) = delete;
     Work& operator=(const Work&) = delete;
     double* p;
@@ -203,9 +203,10 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
     a.used = used.data();
     {
         nb::gil_scoped_release release;
-        Work work(HW_PICK(ep_workspace)(a));
+        const bool few = 2 * members <= hw::ep_abreast;  // narrow registers answer sooner
+        Work work((few ? HW_PICK(ep_workspace) : HW_PICK_WIDE(ep_workspace))(a));
         a.work = work.p;
-        HW_PICK(ep_run)(a);
+        (few ? HW_PICK(ep_run) : HW_PICK_WIDE(ep_run))(a);
     }
     nb::list count;
     for (std::int32_t u : used) count.append(u);
@@ -217,9 +218,10 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
                double rate, double start_eps, double power, double beta_a, double beta_b, In z, In log_proposal,
                const nb::dict& limits, std::optional<nb::tuple> sites, std::optional<In> was, std::optional<In> pull,
                std::optional<In> precision, std::optional<nb::dict> outside) {
-    Problem p(problem, 4);
+    constexpr std::size_t abreast = hw::ep_abreast;
+    Problem p(problem, abreast);
     std::optional<Problem> bounds;
-    if (outside) bounds.emplace(*outside, 4);
+    if (outside) bounds.emplace(*outside, abreast);
     hw::EpLearnArgs l{};
     hw::EpArgs& a = p.a;
     const std::size_t stages = a.T + 1, n = a.n, rows = a.rows, groups = a.groups;
@@ -272,9 +274,9 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     found["sites"] = p.sites(sites, 1);
     const bool outliers = learn_eps || rate > 0.0;
     double* of_lanes[5];
-    nb::object held[5] = {fresh({4, stages, n}, of_lanes), fresh({4, stages, n, n}, of_lanes + 1),
-                          fresh({4, stages, n}, of_lanes + 2), fresh({4, stages, n}, of_lanes + 3),
-                          fresh({4, rows}, of_lanes + 4)};
+    nb::object held[5] = {fresh({abreast, stages, n}, of_lanes), fresh({abreast, stages, n, n}, of_lanes + 1),
+                          fresh({abreast, stages, n}, of_lanes + 2), fresh({abreast, stages, n}, of_lanes + 3),
+                          fresh({abreast, rows}, of_lanes + 4)};
     a.x = of_lanes[0];
     a.P = of_lanes[1];
     a.k3 = of_lanes[2];
@@ -311,9 +313,9 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     {
         nb::gil_scoped_release release;
         l.base = a;
-        Work work(HW_PICK(ep_learn_workspace)(l));
+        Work work(HW_PICK_WIDE(ep_learn_workspace)(l));
         l.base.work = work.p;
-        code = HW_PICK(ep_learn)(l);
+        code = HW_PICK_WIDE(ep_learn)(l);
     }
     found["code"] = code;
     found["log_evidence"] = log_evidence;

@@ -40,7 +40,7 @@ nb::tuple truncated(Vector mu, Vector c, Vector lo, Vector hi) {
     nb::object log_mean = vector(a.size, &a.log_mean);
     {
         nb::gil_scoped_release release;
-        HW_PICK(noise_truncated)(a);
+        HW_PICK_WIDE(noise_truncated)(a);
     }
     return nb::make_tuple(log_z, mean, var, at_lo, at_hi, log_mean);
 }
@@ -64,7 +64,7 @@ nb::tuple tilted(const std::string& kind, Vector mu, Vector c, Vector s, Vector 
     nb::object slope_eps = vector(a.size, &a.slope_eps), out = vector(a.size, &a.out);
     {
         nb::gil_scoped_release release;
-        HW_PICK(noise_tilted)(a);
+        HW_PICK_WIDE(noise_tilted)(a);
     }
     return nb::make_tuple(log_z, mean, var, slope_s, slope_R, slope_eps, out);
 }
@@ -72,6 +72,8 @@ nb::tuple tilted(const std::string& kind, Vector mu, Vector c, Vector s, Vector 
 }  // namespace
 
 void bind_noise(nb::module_& m) {
+    m.def("wide", &hw::wide, "Whether kernels that run members abreast run them with AVX-512, eight to a register.");
+    m.def("use_wide", &hw::use_wide, "wanted"_a, "Run them so or not; False if this machine cannot. For tests.");
     m.def("noise_truncated", &truncated, "mu"_a, "c"_a, "lo"_a, "hi"_a,
           "N(mu, c) cut to [lo, hi], entry by entry: (log Z, mean, variance, tilted density at lo and at hi, log of the "
           "mean density in the box). Ends may be infinite, c may be 0; see core/noise.hpp.");

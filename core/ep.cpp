@@ -53,7 +53,7 @@ void settle_in(Ep<N>& ep, EpFound& f, Place& place) {
 
 template <class N>
 int run(N n, const EpArgs& a) {
-    for (int first = 0; first < a.members; first += lanes) {
+    for (int first = 0; first < a.members; first += wide_lanes) {
         Ep<N> ep{n, a, {first, a.members - 1}, {}, {}};
         EpFound f{};
         Place place{reinterpret_cast<V*>(a.work)};
@@ -63,12 +63,12 @@ int run(N n, const EpArgs& a) {
         EpState& s = ep.s;
         const std::ptrdiff_t stages = a.T + 1;
         const auto member = [&](int l) { return first + l < a.members ? first + l : a.members - 1; };
-        for (int l = 0; l < lanes; l++) {
+        for (int l = 0; l < wide_lanes; l++) {
             for (int g = 0; g < a.groups; g++) s.s[g].set(l, a.s[std::ptrdiff_t(member(l)) * a.groups + g]);
             s.eps.set(l, a.eps[member(l)]);
         }
         if (a.warm) {
-            for (int l = 0; l < lanes; l++) {
+            for (int l = 0; l < wide_lanes; l++) {
                 const std::ptrdiff_t k = member(l);
                 for (std::ptrdiff_t i = 0; i < stages * n; i++) {
                     s.m[i].set(l, a.m[k * stages * n + i]);
@@ -79,9 +79,7 @@ int run(N n, const EpArgs& a) {
                     s.nu[i].set(l, a.nu[k * a.rows + i]);
                 }
             }
-            ep.forget();
-            EpFound none = f;
-            ep.look(none);  // the message of the sites that were given
+            ep.hear();
         } else {
             ep.start();
         }
@@ -89,7 +87,7 @@ int run(N n, const EpArgs& a) {
         ep.cross = wanted;
         ep.look(f);
         if (a.k3) ep.shapes(a.k3, a.k4);
-        for (int l = 0; l < lanes && first + l < a.members; l++) {
+        for (int l = 0; l < wide_lanes && first + l < a.members; l++) {
             const std::ptrdiff_t k = first + l;
             a.log_z[k] = ep.sound(f, l) ? f.log_z[l] : minus_inf;
             a.residual[k] = f.residual[l];
@@ -110,58 +108,65 @@ int run(N n, const EpArgs& a) {
     return 0;
 }
 
+std::size_t learner_parameters(const EpLearnArgs& a) {
+    std::size_t q = a.learn_eps ? 1 : 0;
+    for (int g = 0; g < a.base.groups; g++) q += a.free[g] ? 1 : 0;
+    return q;
+}
+
 template <class N>
 int learn(N n, const EpLearnArgs& a) {
-    Ep<N> ep{n, a.base, {0, lanes - 1}, {}, {}};
+    Ep<N> ep{n, a.base, {0, wide_lanes - 1}, {}, {}};
     EpLearner<N> learner{ep, a};
     Place place{reinterpret_cast<V*>(a.base.work)};
     settle_in(ep, learner.f, place);
     const std::ptrdiff_t size = std::ptrdiff_t(a.base.T + 1) * n;
-    learner.keep_m = place.take(size);
-    learner.keep_D = place.take(size);
-    learner.keep_tau = place.take(a.base.rows);
-    learner.keep_nu = place.take(a.base.rows);
-    learner.was = place.take(a.base.groups + 1);
+    double* p = reinterpret_cast<double*>(place.p);
+    learner.keep_m = p;
+    learner.keep_D = learner.keep_m + size;
+    learner.keep_tau = learner.keep_D + size;
+    learner.keep_nu = learner.keep_tau + a.base.rows;
+    learner.lead = learner.keep_nu + a.base.rows;  // 2 * sites * parameters
     if (!a.outside) return learner.run();
-    Ep<N> outside{n, *a.outside, {0, lanes - 1}, {}, {}};
+    place.p += (2 * std::size_t(size + a.base.rows) * (1 + learner_parameters(a)) + wide_lanes - 1) / wide_lanes;
+    Ep<N> outside{n, *a.outside, {0, wide_lanes - 1}, {}, {}};
     settle_in(outside, learner.fo, place);
-    learner.out_m = place.take(size);
-    learner.out_D = place.take(size);
-    learner.out_tau = place.take(a.outside->rows);
-    learner.out_nu = place.take(a.outside->rows);
     learner.outside = &outside;
     return learner.run();
 }
 
 }  // namespace
 
-std::size_t ep_workspace(const EpArgs& a) { return block_size(a) * lanes; }
+std::size_t ep_workspace(const EpArgs& a) { return block_size(a) * wide_lanes; }
 
 int ep_run(const EpArgs& a) {
     const FlushTiny flush;
     switch (a.n) {
+#ifndef HW_FEW_SIZES
         case 1: return run(Dim<1>(), a);
         case 2: return run(Dim<2>(), a);
-        case 3: return run(Dim<3>(), a);
         case 4: return run(Dim<4>(), a);
+#endif
+        case 3: return run(Dim<3>(), a);
         default: return run(Dim<0>(a.n), a);
     }
 }
 
 std::size_t ep_learn_workspace(const EpLearnArgs& a) {
-    const std::size_t sites = 2 * std::size_t(a.base.T + 1) * a.base.n;
-    const std::size_t more = sites + 2 * std::size_t(a.base.rows) + a.base.groups + 1;
-    const std::size_t own = ep_workspace(a.base) + more * lanes;
-    return a.outside ? own + ep_workspace(*a.outside) + (sites + 2 * std::size_t(a.outside->rows)) * lanes : own;
+    const std::size_t sites = std::size_t(a.base.T + 1) * a.base.n + a.base.rows;
+    const std::size_t own = ep_workspace(a.base) + 2 * sites * (1 + learner_parameters(a));
+    return a.outside ? own + wide_lanes + ep_workspace(*a.outside) : own;
 }
 
 int ep_learn(const EpLearnArgs& a) {
     const FlushTiny flush;
     switch (a.base.n) {
+#ifndef HW_FEW_SIZES
         case 1: return learn(Dim<1>(), a);
         case 2: return learn(Dim<2>(), a);
-        case 3: return learn(Dim<3>(), a);
         case 4: return learn(Dim<4>(), a);
+#endif
+        case 3: return learn(Dim<3>(), a);
         default: return learn(Dim<0>(a.base.n), a);
     }
 }

@@ -21,7 +21,7 @@
 // Evidence: log Z = sum over sites of (log Z_k - log of the site's integral under its cavity) + the Gaussian's own; at a
 // fixed point its derivative in a parameter of f_k is that of log Z_k alone.
 //
-// Four members (same rows, other half-widths or matrices) run side by side, one a lane.
+// Members (same rows, other half-widths or matrices) run side by side, one a lane.
 #pragma once
 
 #include "chain.hpp"
@@ -32,10 +32,14 @@
 namespace hw {
 namespace HW_ISA {
 
-typedef Lanes<4> V;
+typedef Lanes<wide_lanes> V;
+typedef V::Raw X;
 
-inline V of(V4 a) { return V::of(a); }
-inline V smaller(const V& a, const V& b) { return V::of(a.v < b.v ? a.v : b.v); }
+inline V of(X a) { return V::of(a); }
+inline V smaller(const V& a, const V& b) { return V::of(min4(a.v, b.v)); }
+inline V root(const V& a) { return V::of(sqrt4(a.v)); }
+inline V log_of(const V& a) { return V::of(log4(a.v)); }
+inline V either(decltype(X{} < X{}) test, const V& a, const V& b) { return V::of(test ? a.v : b.v); }
 
 // sizes of local arrays
 template <class N>
@@ -44,28 +48,30 @@ constexpr int ep_cap = N::fixed ? N::cap : ep_states;
 // L (n,n) = lower Cholesky factor of a positive semidefinite M (n,n); directions below rounding are left out
 template <class N>
 inline void ep_root(N n, const V* M, V* L) {
+    constexpr int c = ep_cap<N>;
+    V inverse[c];
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j <= i; j++) L[i * n + j] = M[i * n + j];
     for (int j = 0; j < n; j++) {
-        V p = M[j * n + j];
-        for (int k = 0; k < j; k++) p -= L[j * n + k] * L[j * n + k];
-        const V floor = V(1e-14) * M[j * n + j] + V(1e-300);
-        const auto fine = p.v > floor.v;
-        const V root = of(fine ? sqrt4(p.v) : V4{}), inverse = of(fine ? 1.0 / root.v : V4{});
-        for (int i = 0; i < j; i++) L[i * n + j] = V(0.0);
-        L[j * n + j] = root;
+        const V p = L[j * n + j], floor = V(1e-14) * M[j * n + j] + V(1e-300);
+        inverse[j] = either(p.v > floor.v, V(1.0) / p, V(0.0));
         for (int i = j + 1; i < n; i++) {
-            V s = M[i * n + j];
-            for (int k = 0; k < j; k++) s -= L[i * n + k] * L[j * n + k];
-            L[i * n + j] = s * inverse;
+            const V share = L[i * n + j] * inverse[j];
+            for (int k = j + 1; k <= i; k++) L[i * n + k] -= share * L[k * n + j];
         }
+    }
+    for (int j = 0; j < n; j++) {
+        const V scale = root(inverse[j]);
+        for (int i = 0; i < j; i++) L[i * n + j] = V(0.0);
+        for (int i = j; i < n; i++) L[i * n + j] *= scale;
     }
 }
 
-// out (n,n) = ((L L')^-1 + M)^-1 = L (I + L' M L)^-1 L' for a lower L and a symmetric M >= 0; the determinant of
-// I + L' M L is multiplied into `det` if it is given
+// out (n,n) = ((L L')^-1 + M)^-1 = L (I + L' M L)^-1 L' for a lower L and a symmetric M >= 0
 template <class N>
-inline void ep_join(N n, const V* L, const V* M, V* out, V* det = nullptr) {
+inline void ep_join(N n, const V* L, const V* M, V* out) {
     constexpr int c = ep_cap<N>;
-    V S[c * c], Y[c * c], work[c];
+    V S[c * c], Y[c * c];
     for (int i = 0; i < n; i++)  // Y = M L
         for (int j = 0; j < n; j++) {
             V s(0.0);
@@ -78,9 +84,15 @@ inline void ep_join(N n, const V* L, const V* M, V* out, V* det = nullptr) {
             for (int k = i; k < n; k++) s += L[k * n + i] * Y[k * n + j];
             S[i * n + j] = s;
         }
-    unit_factor(n, S, 0.0, work);
-    if (det)
-        for (int i = 0; i < n; i++) *det = *det / S[i * n + i];
+    for (int j = 0; j < n; j++) {  // S = unit lower factor below the diagonal, 1 / pivot on it
+        const V over = either(S[j * n + j].v > X{}, V(1.0) / S[j * n + j], V(0.0));  // lost to rounding: left out
+        for (int i = j + 1; i < n; i++) {
+            const V share = S[i * n + j] * over;
+            for (int k = j + 1; k <= i; k++) S[i * n + k] -= share * S[k * n + j];
+        }
+        for (int i = j + 1; i < n; i++) S[i * n + j] *= over;
+        S[j * n + j] = over;
+    }
     for (int j = 0; j < n; j++) {  // row j of L is column j of L'
         V* y = Y + j * n;
         for (int i = 0; i < n; i++) y[i] = L[j * n + i];
@@ -96,11 +108,11 @@ inline void ep_join(N n, const V* L, const V* M, V* out, V* det = nullptr) {
 
 // A stack of matrices for one block of members, brought into lanes.
 struct EpBlock {
-    int first, last;  // members first .. first + 3, held at `last`
+    int first, last;  // members first, first + 1, ..., held at `last`
     inline V load(const EpStack& s, std::ptrdiff_t at) const {
         if (s.member == 0) return V(s.data[at]);
         V v;
-        for (int l = 0; l < lanes; l++) {
+        for (int l = 0; l < wide_lanes; l++) {
             const int k = first + l < last ? first + l : last;
             v.set(l, s.data[k * s.member + at]);
         }
@@ -124,7 +136,7 @@ struct EpState {
 
 // What a sweep finds.
 struct EpFound {
-    V residual;   // largest distance of a site's moments from the belief's, in standard deviations
+    V residual;   // largest distance of a site's moments from the belief's, in standard deviations; its square in a sweep
     V log_z;      // evidence
     V* slope;     // (groups + 1,): d log Z / d log s, d log Z / d logit eps
     V* learned;   // (groups,): sum over the rows of a half-width of (1 - posterior / prior variance)^2
@@ -150,6 +162,9 @@ struct Ep {
     EpBlock block;
     EpState s;
     EpCross cross;
+    // A bound farther off than the root of `reach` standard deviations, or one that narrows its cavity's variance by a
+    // share below `faint`, says nothing at the precision that is asked for.
+    double reach = 72.0, faint = 1e-13;
 
     inline int packed() const { return n * (n + 1) / 2; }
     inline void unpack(const V* p, V* M) const {
@@ -176,23 +191,28 @@ struct Ep {
         return R;
     }
 
-    inline Tilted4 tilted(int k, const V& mu, const V& c) const {
+    template <int depth>
+    inline Tilted<X> tilted(int k, const Cavity<X>& q) const {
         switch (kind(k)) {
             case ep_truncation: {
-                const Truncated4 t = truncated4(mu.v, c.v, all4(a.lo[k]), all4(a.hi[k]));
-                Tilted4 r{};
-                r.log_z = t.log_z;
+                const Truncated<X> t = cut4<depth>(q, all<X>(a.lo[k]), all<X>(a.hi[k]));
+                Tilted<X> r{};
                 r.mean = t.mean;
                 r.var = t.var;
+                if (depth >= evidence) r.log_z = t.log_z;
+                if (depth == cumulants) {
+                    r.k3 = t.k3;
+                    r.k4 = t.k4;
+                }
                 return r;
             }
-            case noise_uniform: return uniform4(mu.v, c.v, s.s[a.group[k]].v);
-            case noise_uniform_gaussian: return uniform_gaussian4(mu.v, c.v, s.s[a.group[k]].v, variance(k).v);
+            case noise_uniform: return uniform4<depth>(q, s.s[a.group[k]].v);
+            case noise_uniform_gaussian: return uniform_gaussian4<depth>(q, s.s[a.group[k]].v, variance(k).v);
             case noise_contaminated:
-                return contaminated4(mu.v, c.v, s.s[a.group[k]].v, variance(k).v, s.eps.v, all4(a.wide));
+                return contaminated4<depth>(q, s.s[a.group[k]].v, variance(k).v, s.eps.v, all<X>(a.wide));
             default:
-                return maybe_lost4(mu.v, c.v, a.group[k] >= 0 ? s.s[a.group[k]].v : V4{}, variance(k).v, s.eps.v,
-                                   all4(a.lost[k]));
+                return maybe_lost4<depth>(q, a.group[k] >= 0 ? s.s[a.group[k]].v : X{}, variance(k).v, s.eps.v,
+                                          all<X>(a.lost[k]));
         }
     }
 
@@ -223,23 +243,6 @@ struct Ep {
     void forget() {
         for (int k = 0; k < (a.T + 1) * n; k++) s.eb[k] = V(0.0);
         for (int k = 0; k < (a.T + 1) * packed(); k++) s.Lb[k] = V(0.0);
-    }
-
-    // sites follow half-widths that change from `was` to s.s
-    void rescale(const V* was) {
-        for (int t = 1; t <= a.T; t++)
-            for (int i = 0; i < n; i++)
-                if (a.group_w[i] >= 0) {
-                    const V f = s.s[a.group_w[i]] / larger(was[a.group_w[i]], V(1e-300));
-                    s.D[t * n + i] *= f * f;
-                    s.m[t * n + i] *= f;
-                }
-        for (int k = 0; k < a.rows; k++)
-            if (kind(k) != noise_gaussian && kind(k) != ep_truncation && a.group[k] >= 0) {
-                const V f = was[a.group[k]] / larger(s.s[a.group[k]], V(1e-300));
-                s.tau[k] *= f * f;
-                s.nu[k] *= f;
-            }
     }
 
     // ---- a stage -------------------------------------------------------------------------------------------------
@@ -280,6 +283,7 @@ struct Ep {
         unpack(s.Lb + t * packed(), Lambda);
         for (int i = 0; i < n; i++) eta[i] = s.eb[t * n + i];
         for (int k = a.start[t]; k < a.start[t + 1]; k++) {
+            if (silent(k)) continue;
             V h[cap];
             row(k, h);
             const V lift = s.nu[k] + s.tau[k] * target(k);
@@ -290,6 +294,8 @@ struct Ep {
             }
         }
     }
+    // a bound that no lane has come near
+    inline bool silent(int k) const { return kind(k) == ep_truncation && !any4(s.tau[k].v != X{}); }
     inline void row(int k, V* h) const {
         for (int i = 0; i < n; i++) h[i] = block.load(a.h, static_cast<std::ptrdiff_t>(k) * n + i);
     }
@@ -298,93 +304,136 @@ struct Ep {
     // log of the integral of exp(nu z - tau z^2 / 2) under N(mu, v)
     static inline V integral(const V& tau, const V& nu, const V& mu, const V& v) {
         const V f = V(1.0) + tau * v;
-        return V(0.5) * ((nu * nu * v + V(2.0) * nu * mu - tau * mu * mu) / f - of(log4(f.v)));
+        return V(0.5) * ((nu * nu * v + V(2.0) * nu * mu - tau * mu * mu) / f - log_of(f));
     }
 
-    static inline void note(EpFound& f, const V& mean, const V& var, const Tilted4& t, const V& mu, const V& c) {
+    // moments (mean, var) of the belief against those that its factor asks for; over = 1 / var of the factor
+    static inline void note(EpFound& f, const V& mean, const V& var, const V& tm, const V& tv, const V& over, const Cavity<X>& q) {
         // a factor that would widen the belief has an empty site: nothing to agree on
-        const V tv = larger(of(t.var), V(1e-300)), off = of(t.mean) - mu;
-        f.far = larger(f.far, off * off / larger(c, V(1e-300)));
-        const V d = of(t.mean) - mean, e = magnitude(tv - var) / tv;
-        const V gap = larger(of(sqrt4((d * d / tv).v)), e);
-        f.residual = larger(f.residual, of(tv.v >= c.v * (1.0 - 1e-9) ? V4{} : gap.v));
+        const V off = tm - of(q.mu), d = tm - mean, e = (tv - var) * over, scale = of(q.scale);
+        f.far = larger(f.far, off * off * scale * scale);
+        const V gap = larger(d * d * over, e * e);
+        f.residual = larger(f.residual, either(tv.v >= q.c * (1.0 - 1e-9), V(0.0), gap));
     }
 
-    // renew (or, for the evidence, look at) the rows of stage t, given the belief ms, Ps about x_t
+    // renew (or, for the evidence, look at) the rows of stage t given the belief ms, Ps about x_t; fold each into the
+    // filtered mf, Pf
     template <bool renew>
-    inline void rows(int t, V* ms, V* Ps, EpFound& f, double damping) {
+    inline void rows(int t, V* ms, V* Ps, V* mf, V* Pf, EpFound& f, double damping) {
         for (int k = a.start[t]; k < a.start[t + 1]; k++) {
-            const bool fixed = kind(k) == noise_gaussian;
-            if constexpr (!renew) f.top += densest(k);
-            if (fixed) {
-                if constexpr (!renew) {
+            V h[cap], Ph[cap];
+            row(k, h);
+            if constexpr (!renew) {
+                f.top += densest(k);
+                if (kind(k) == noise_gaussian) {
                     f.log_z -= V(0.5) * V(log_2pi + std::log(a.R[k]));
                     if (cross.S) cross.r3[k] = cross.r4[k] = V(0.0);
                 }
-                continue;
             }
-            V h[cap], Ph[cap];
-            row(k, h);
-            V z = -target(k), v(0.0);
-            for (int i = 0; i < n; i++) {
-                V q(0.0);
-                for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
-                Ph[i] = q;
-                v += h[i] * q;
-                z += h[i] * ms[i];
-            }
-            v = larger(v, V(0.0));
-            // the cavity; a site that claims more than the belief has is a bad one and is taken as nothing
-            const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9));
-            const V c = v / open, mu = (z - v * s.nu[k]) / open;
-            const Tilted4 q = tilted(k, mu, c);
-            note(f, z, v, q, mu, c);
-            if constexpr (renew) {
-                const V tv = larger(of(q.var), V(1e-300));
-                V tau = V(1.0) / tv - V(1.0) / larger(c, V(1e-300));
-                V nu = of(q.mean) / tv - mu / larger(c, V(1e-300));
-                const auto wide = tau.v <= V4{};  // the factor widens the belief: it says nothing for now
-                nu = of(wide ? V4{} : nu.v);
-                tau = of(wide ? V4{} : tau.v);
-                const double step = kind(k) >= noise_contaminated && kind(k) != ep_truncation ? damping : 1.0;
-                const V dt = V(step) * (tau - s.tau[k]), dn = V(step) * (nu - s.nu[k]);
-                const V gain = V(1.0) / larger(V(1.0) + dt * v, V(1e-12));
-                s.tau[k] += dt;
-                s.nu[k] += dn;
-                const V shift = (dn - dt * z) * gain, shrink = dt * gain;
+            if (kind(k) != noise_gaussian) {
+                V z = -target(k), v(0.0);
                 for (int i = 0; i < n; i++) {
-                    ms[i] += Ph[i] * shift;
-                    const V g = Ph[i] * shrink;
-                    for (int j = 0; j < n; j++) Ps[i * n + j] -= g * Ph[j];
+                    V q(0.0);
+                    for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
+                    Ph[i] = q;
+                    v += h[i] * q;
+                    z += h[i] * ms[i];
                 }
-            } else {
-                f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], mu, c);
-                f.worst = smaller(f.worst, of(q.log_z) + unit(k));
-                slopes(k, q, v, f);
-                if (cross.S) ratios(shape(k, mu, c), v, cross.r3 + k, cross.r4 + k);
-                if (a.out) {
-                    for (int l = 0; l < lanes && block.first + l <= block.last; l++)
-                        a.out[static_cast<std::ptrdiff_t>(block.first + l) * a.rows + k] = q.out[l];
+                if (silent(k) && far_inside(k, z, v)) {
+                    if (!renew && cross.S) cross.r3[k] = cross.r4[k] = V(0.0);
+                    continue;
                 }
+                renew_row<renew>(k, z, v, Ph, ms, Ps, f, damping);
             }
+            fold<renew>(k, h, mf, Pf, f);
+        }
+    }
+    // both ends of a bound out of reach in every lane
+    inline bool far_inside(int k, const V& z, const V& v) const {
+        const X up = a.hi[k] - z.v, down = z.v - a.lo[k], least = reach * v.v + 1e-300;
+        return !any4((up < X{}) | (down < X{}) | (up * up < least) | (down * down < least) | (v.v != v.v));
+    }
+
+    template <bool renew>
+    inline void renew_row(int k, const V& z, V v, const V* Ph, V* ms, V* Ps, EpFound& f, double damping) {
+        // the cavity; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
+        const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9)), over_open = V(1.0) / open;
+        v = larger(v, V(1e-300));
+        const V over_v = V(1.0) / v;
+        const V c = smaller(v * over_open, V(1e300)), mu = (z - v * s.nu[k]) * over_open, w = open * over_v;
+        const V scale = root(w);
+        const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};
+        if constexpr (renew) {
+            const Tilted<X> q = tilted<moments>(k, cavity);
+            const V tv = larger(of(q.var), V(1e-300)), tm = of(q.mean), over = V(1.0) / tv;
+            note(f, z, v, tm, tv, over, cavity);
+            // else the factor widens the belief: nothing for now
+            const auto says = tv.v < c.v * (1.0 - (kind(k) == ep_truncation ? faint : 1e-13));
+            const V tau = either(says, over - w, V(0.0)), nu = either(says, tm * over - mu * w, V(0.0));
+            // by what the site changes: a site that stays leaves the belief as it is, whatever rounding made of v
+            const V step(kind(k) >= noise_contaminated && kind(k) != ep_truncation ? damping : 1.0);
+            const V dt = step * (tau - s.tau[k]), dn = step * (nu - s.nu[k]);
+            const V gain = V(1.0) / larger(V(1.0) + dt * v, V(1e-12));
+            s.tau[k] += dt;
+            s.nu[k] += dn;
+            const V shift = (dn - dt * z) * gain, shrink = dt * gain;
+            for (int i = 0; i < n; i++) {
+                ms[i] += Ph[i] * shift;
+                const V g = Ph[i] * shrink;
+                for (int j = 0; j < n; j++) Ps[i * n + j] -= g * Ph[j];
+            }
+        } else {
+            const Tilted<X> q = cross.S ? tilted<cumulants>(k, cavity) : tilted<evidence>(k, cavity);
+            const V tv = larger(of(q.var), V(1e-300));
+            note(f, z, v, of(q.mean), tv, V(1.0) / tv, cavity);
+            f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], mu, c);
+            f.worst = smaller(f.worst, of(q.log_z) + unit(k));
+            slopes(k, q, v, f);
+            if (cross.S) ratios(q, v, cross.r3 + k, cross.r4 + k);
+            if (a.out) {
+                for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++)
+                    a.out[static_cast<std::ptrdiff_t>(block.first + l) * a.rows + k] = q.out[l];
+            }
+        }
+    }
+
+    // site of row k into the filtered moments mf, Pf
+    template <bool renew>
+    inline void fold(int k, const V* h, V* mf, V* Pf, EpFound& f) {
+        V Ph[cap];
+        V z = -target(k), v(0.0);
+        for (int i = 0; i < n; i++) {
+            V q(0.0);
+            for (int j = 0; j < n; j++) q += Pf[i * n + j] * h[j];
+            Ph[i] = q;
+            v += h[i] * q;
+            z += h[i] * mf[i];
+        }
+        const V tau = s.tau[k], gain = V(1.0) / (V(1.0) + tau * v);
+        if constexpr (!renew) f.log_z += integral(tau, s.nu[k], z, v);
+        const V shift = (s.nu[k] - tau * z) * gain, shrink = tau * gain;
+        for (int i = 0; i < n; i++) {
+            mf[i] += Ph[i] * shift;
+            const V g = Ph[i] * shrink;
+            for (int j = 0; j < n; j++) Pf[i * n + j] -= g * Ph[j];
         }
     }
 
     // log of the width of a row's box: with it the log of a density becomes that of a share
     inline V unit(int k) const {
-        return kind(k) != ep_truncation && a.group[k] >= 0 ? of(log4(2.0 * s.s[a.group[k]].v + 1e-300)) : V(0.0);
+        return kind(k) != ep_truncation && a.group[k] >= 0 ? log_of(V(2.0) * s.s[a.group[k]] + V(1e-300)) : V(0.0);
     }
 
     // log of the largest density of a row's noise
     inline V densest(int k) const {
         if (kind(k) == ep_truncation) return V(0.0);
         const V half = a.group[k] >= 0 ? s.s[a.group[k]] : V(0.0), R = variance(k);
-        const V box = -of(log4(2.0 * half.v + 1e-300)), bell = V(-0.5) * of(log4(6.283185307179586 * R.v + 1e-300));
+        const V box = -log_of(V(2.0) * half + V(1e-300)), bell = V(-0.5) * log_of(V(6.283185307179586) * R + V(1e-300));
         const V most = smaller(box, bell);
         return kind(k) == noise_maybe_lost ? larger(most, V(a.lost[k])) : most;
     }
 
-    inline void slopes(int k, const Tilted4& q, const V& v, EpFound& f) const {
+    inline void slopes(int k, const Tilted<X>& q, const V& v, EpFound& f) const {
         if (kind(k) == ep_truncation) return;
         if (a.group[k] >= 0) {
             f.slope[a.group[k]] += of(q.slope_s);
@@ -434,6 +483,8 @@ struct Ep {
             }
             for (int i = 0; i < n; i++) s.mp[t * n + i] = mp[i];
             pack(Pp, s.Pp + t * packed());
+            for (int i = 0; i < n; i++) mf[i] = mp[i];
+            for (int i = 0; i < n * n; i++) Pf[i] = Pp[i];
             if (a.start[t] < a.start[t + 1] || !renew) {
                 V Lambda[cap * cap], eta[cap], L[cap * cap], ms[cap], Ps[cap * cap];
                 ahead(t, Lambda, eta);
@@ -449,30 +500,7 @@ struct Ep {
                     give(t, ms, Ps);
                     for (int i = 0; i < n * n; i++) cross.S[t * n * n + i] = Ps[i];
                 }
-                rows<renew>(t, ms, Ps, f, damping);
-            }
-            // filtered: the rows of t folded in one after the other
-            for (int i = 0; i < n; i++) mf[i] = mp[i];
-            for (int i = 0; i < n * n; i++) Pf[i] = Pp[i];
-            for (int k = a.start[t]; k < a.start[t + 1]; k++) {
-                V h[cap], Ph[cap];
-                row(k, h);
-                V z = -target(k), v(0.0);
-                for (int i = 0; i < n; i++) {
-                    V q(0.0);
-                    for (int j = 0; j < n; j++) q += Pf[i * n + j] * h[j];
-                    Ph[i] = q;
-                    v += h[i] * q;
-                    z += h[i] * mf[i];
-                }
-                const V tau = s.tau[k], gain = V(1.0) / (V(1.0) + tau * v);
-                if constexpr (!renew) f.log_z += integral(tau, s.nu[k], z, v);
-                const V shift = (s.nu[k] - tau * z) * gain, shrink = tau * gain;
-                for (int i = 0; i < n; i++) {
-                    mf[i] += Ph[i] * shift;
-                    const V g = Ph[i] * shrink;
-                    for (int j = 0; j < n; j++) Pf[i * n + j] -= g * Ph[j];
-                }
+                rows<renew>(t, ms, Ps, mf, Pf, f, damping);
             }
             if (!renew && cross.S)
                 for (int i = 0; i < n * n; i++) cross.Pf[t * n * n + i] = Pf[i];
@@ -502,31 +530,48 @@ struct Ep {
             if (!renew && cross.S) covariances(t, A, G, W, Pp);
             if (t > 0 && a.G.data) turn(G, W, r);
             sites<renew>(t, W, r, f);
-            if (t == 0) break;
-            V Q[cap * cap], d[cap];
-            noise(t, G, Q, d);
-            ep_join(n, U, Q, W);
-            for (int i = 0; i < n; i++)
-                for (int j = 0; j < n; j++) eta[i] -= Lambda[i * n + j] * d[j];
-            less(W, Q, eta, r);
-            V WA[cap * cap];
-            for (int i = 0; i < n; i++)
-                for (int j = 0; j < n; j++) {
-                    V q(0.0);
-                    for (int k = 0; k < n; k++) q += W[i * n + k] * A[k * n + j];
-                    WA[i * n + j] = q;
-                }
-            V *eb = s.eb + (t - 1) * n, *Lb = s.Lb + (t - 1) * packed();
-            for (int i = 0; i < n; i++) {
+            if (t > 0) pass_on(t, A, G, Lambda, eta, U);
+        }
+    }
+
+    // Lambda, eta of t and the root U of Lambda become the message to t - 1
+    inline void pass_on(int t, const V* A, const V* G, const V* Lambda, V* eta, const V* U) {
+        V Q[cap * cap], d[cap], W[cap * cap], WA[cap * cap], r[cap];
+        noise(t, G, Q, d);
+        ep_join(n, U, Q, W);
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) eta[i] -= Lambda[i * n + j] * d[j];
+        less(W, Q, eta, r);
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
                 V q(0.0);
-                for (int k = 0; k < n; k++) q += A[k * n + i] * r[k];
-                eb[i] = q;
-                for (int j = 0; j <= i; j++) {
-                    V p(0.0);
-                    for (int k = 0; k < n; k++) p += A[k * n + i] * WA[k * n + j];
-                    Lb[tri(i, j)] = p;
-                }
+                for (int k = 0; k < n; k++) q += W[i * n + k] * A[k * n + j];
+                WA[i * n + j] = q;
             }
+        V *eb = s.eb + (t - 1) * n, *Lb = s.Lb + (t - 1) * packed();
+        for (int i = 0; i < n; i++) {
+            V q(0.0);
+            for (int k = 0; k < n; k++) q += A[k * n + i] * r[k];
+            eb[i] = q;
+            for (int j = 0; j <= i; j++) {
+                V p(0.0);
+                for (int k = 0; k < n; k++) p += A[k * n + i] * WA[k * n + j];
+                Lb[tri(i, j)] = p;
+            }
+        }
+    }
+
+    // the future's messages of the sites as they are
+    void hear() {
+        V A[cap * cap], G[cap * cap] = {}, Lambda[cap * cap], eta[cap], U[cap * cap];
+        for (int i = 0; i < n; i++) s.eb[a.T * n + i] = V(0.0);
+        for (int i = 0; i < packed(); i++) s.Lb[a.T * packed() + i] = V(0.0);
+        for (int t = a.T; t > 0; t--) {
+            block.loads(a.A, t - 1, n * n, A);
+            if (a.G.data) block.loads(a.G, t - 1, n * n, G);
+            ahead(t, Lambda, eta);
+            ep_root(n, Lambda, U);
+            pass_on(t, A, G, Lambda, eta, U);
         }
     }
 
@@ -610,7 +655,7 @@ struct Ep {
                     rows_shape(u, R, c3, c4);
                 }
             }
-            for (int l = 0; l < lanes && block.first + l <= block.last; l++) {
+            for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++) {
                 const std::ptrdiff_t at = (static_cast<std::ptrdiff_t>(block.first + l) * (a.T + 1) + t) * n;
                 for (int i = 0; i < n; i++) {
                     const double v = max2(S[i * n + i][l], 1e-300), sd = std::sqrt(v);
@@ -675,26 +720,10 @@ struct Ep {
         }
     }
 
-    inline Shape4 shape(int k, const V& mu, const V& c) const {
-        const V4 half = a.group[k] >= 0 ? s.s[a.group[k]].v : V4{};
-        if (kind(k) == ep_truncation) return truncated_shape4(mu.v, c.v, all4(a.lo[k]), all4(a.hi[k]));
-        if (kind(k) == noise_uniform) return truncated_shape4(mu.v, c.v, -half, half);
-        const V4 R = variance(k).v;
-        const Shape4 f = uniform_gaussian_shape4(mu.v, c.v, half, R);
-        if (kind(k) == noise_uniform_gaussian) return f;
-        const V4 p = tilted(k, mu, c).out;
-        if (kind(k) == noise_contaminated)
-            return mixture_shape4(f, gaussian_shape4(mu.v, c.v, R + a.wide * a.wide * half * half), p);
-        Shape4 g{};
-        g.mean = mu.v;
-        g.m2 = c.v;
-        g.m4 = 3.0 * c.v * c.v;
-        return mixture_shape4(f, g, p);
-    }
-    static inline void ratios(const Shape4& q, const V& v, V* out3, V* out4) {
+    static inline void ratios(const Tilted<X>& q, const V& v, V* out3, V* out4) {
         const V w = V(1.0) / larger(v, V(1e-60));
-        *out3 = of(q.k3()) * w * w * w;
-        *out4 = of(q.k4()) * w * w * w * w;
+        *out3 = of(q.k3) * w * w * w;
+        *out4 = of(q.k4) * w * w * w * w;
     }
 
     // r = (I - W P) g = (I + Lambda P)^-1 g
@@ -742,14 +771,19 @@ struct Ep {
                 if (!renew && cross.S) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
                 continue;
             }
-            const V half = larger(width(t, i), V(1e-150));
-            const V know = larger(W[i * n + i], V(1e-8) / (half * half));  // nothing known: a wide cavity
-            const V c = larger(V(1.0) / know - D[i], V(1e-12) * D[i]), mu = m[i] + r[i] / know;
-            const Tilted4 q = uniform4(mu.v, c.v, half.v);
-            note(f, m[i] + D[i] * r[i], D[i] * (V(1.0) - D[i] * know), q, mu, c);
+            const V half = larger(width(t, i), V(1e-150)), square = half * half;
+            V know = W[i * n + i];
+            if (any4(know.v * square.v < all<X>(1e-8))) know = larger(know, V(1e-8) / square);  // nothing known: a wide cavity
+            const V over_know = V(1.0) / know, told = D[i] * know, open = larger(V(1.0) - told, V(1e-12) * told);
+            const V c = open * over_know, mu = m[i] + r[i] * over_know, w = know / open, scale = root(w);
+            const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};
+            const V mean = m[i] + D[i] * r[i], var = D[i] * (V(1.0) - told);
             if constexpr (renew) {
-                const V rest = larger(V(1.0) - of(q.var) / c, V(1e-6));  // 1 - tilted variance over the cavity's
-                const V dD = of(q.var) / rest - D[i], dm = mu + (of(q.mean) - mu) / rest - m[i];
+                const Tilted<X> q = uniform4<moments>(cavity, half.v);
+                const V tv = of(q.var), tm = of(q.mean);
+                note(f, mean, var, tm, larger(tv, V(1e-300)), V(1.0) / larger(tv, V(1e-300)), cavity);
+                const V rest = larger(V(1.0) - tv * w, V(1e-6));  // 1 - tilted variance over the cavity's
+                const V over = V(1.0) / rest, dD = tv * over - D[i], dm = mu + (tm - mu) * over - m[i];
                 const V gain = V(1.0) / larger(V(1.0) + dD * W[i * n + i], V(1e-12));
                 const V shift = (r[i] * dD + dm) * gain, shrink = dD * gain;
                 V column[cap];
@@ -762,24 +796,25 @@ struct Ep {
                 D[i] += dD;
                 m[i] += dm;
             } else {
+                const Tilted<X> q = cross.S ? uniform4<cumulants>(cavity, half.v) : uniform4<evidence>(cavity, half.v);
+                const V tv = larger(of(q.var), V(1e-300));
+                note(f, mean, var, of(q.mean), tv, V(1.0) / tv, cavity);
                 const V spread = D[i] + c, d = m[i] - mu;
-                f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + of(log4(spread.v)) + d * d / spread);
-                f.worst = smaller(f.worst, of(q.log_z) + of(log4(2.0 * half.v)));
+                f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + log_of(spread) + d * d / spread);
+                f.worst = smaller(f.worst, of(q.log_z) + log_of(V(2.0) * half));
                 if (t > 0) {
-                    const V share = larger(V(1.0) - V(3.0) * D[i] * (V(1.0) - D[i] * know) / (half * half), V(0.0));
+                    const V share = larger(V(1.0) - V(3.0) * var / square, V(0.0));
                     f.slope[a.group_w[i]] += of(q.slope_s);
                     f.learned[a.group_w[i]] += share * share;
                 }
-                if (cross.S)
-                    ratios(truncated_shape4(mu.v, c.v, -half.v, half.v), D[i] * (V(1.0) - D[i] * know),
-                           cross.w3 + t * n + i, cross.w4 + t * n + i);
+                if (cross.S) ratios(q, var, cross.w3 + t * n + i, cross.w4 + t * n + i);
             }
         }
     }
 
     // belief about x_t to the caller
     inline void give(int t, const V* ms, const V* Ps) const {
-        for (int l = 0; l < lanes && block.first + l <= block.last; l++) {
+        for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++) {
             const std::ptrdiff_t at = static_cast<std::ptrdiff_t>(block.first + l) * (a.T + 1) + t;
             for (int i = 0; i < n; i++) a.x[at * n + i] = ms[i][l];
             if (a.P)
@@ -803,16 +838,19 @@ struct Ep {
         clear(f);
         forward<true>(f, damping);
         backward<true>(f);
+        f.residual = root(f.residual);
     }
 
     // Sweep until the moments agree within `tol` in every lane that is alive; returns the sweeps. A lane is dead when its
     // numbers are no longer finite or a factor lies thousands of standard deviations from where the others put it: no
     // trajectory fits, and its sites run away.
     int settle(EpFound& f, int sweeps, double tol, double damping) {
+        reach = min2(max2(2.0 * std::log(1e3 / max2(tol, 1e-300)), 20.0), 72.0);
+        faint = min2(max2(2e-3 * tol, 1e-13), 1e-4);
         for (int k = 1; k <= sweeps; k++) {
             sweep(f, damping);
             bool done = true;
-            for (int l = 0; l < lanes; l++)
+            for (int l = 0; l < wide_lanes; l++)
                 if (alive(f, l) && !(f.residual[l] < tol)) done = false;
             if (done) return k;
         }
@@ -825,6 +863,7 @@ struct Ep {
         clear(f);
         forward<false>(f, 1.0);
         backward<false>(f);
+        f.residual = root(f.residual);
     }
     static inline bool sound(const EpFound& f, int l) {
         return finite(f.log_z[l]) && finite(f.residual[l]) && f.worst[l] > -60.0 && f.log_z[l] < f.top[l] + 10.0;

@@ -4,13 +4,14 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "isa.hpp"
+#include "wide.hpp"
 #include "noise_entry.hpp"
 
 namespace hw {
 
 constexpr int ep_truncation = noise_kinds;  // a row that keeps its residual in [lo, hi]: bounds, half-spaces
 constexpr int ep_states = 16;               // most states
+constexpr int ep_abreast = 8;               // most members in one register
 
 // Matrices over time: one, one a row, or an index a row; the same for all members or one stack each.
 struct EpStack {
@@ -55,7 +56,7 @@ struct EpArgs {
     double* work;                  // ep_workspace doubles, on a 32-byte boundary
 };
 
-// Half-widths and the rate of outliers found by evidence; see core/ep_learn.hpp. `base` has four members for the lanes
+// Half-widths and the rate of outliers found by evidence; see core/ep_learn.hpp. `base` has a member for each of `ep_abreast` lanes
 // (its m, D, tau, nu hold one: the mode's, on the way in too if it is warm).
 struct EpLearnArgs {
     EpArgs base;
@@ -85,7 +86,7 @@ struct EpLearnArgs {
 
 }  // namespace hw
 
-HW_KERNEL(std::size_t, ep_workspace, const hw::EpArgs& args)
-HW_KERNEL(int, ep_run, const hw::EpArgs& args)
-HW_KERNEL(std::size_t, ep_learn_workspace, const hw::EpLearnArgs& args)
-HW_KERNEL(int, ep_learn, const hw::EpLearnArgs& args)
+HW_WIDE_KERNEL(std::size_t, ep_workspace, const hw::EpArgs& args)
+HW_WIDE_KERNEL(int, ep_run, const hw::EpArgs& args)
+HW_WIDE_KERNEL(std::size_t, ep_learn_workspace, const hw::EpLearnArgs& args)
+HW_WIDE_KERNEL(int, ep_learn, const hw::EpLearnArgs& args)

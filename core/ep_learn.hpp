@@ -3,9 +3,10 @@
 // phi = log s of the free half-widths, logit eps last if it is learned. The prior of a rate is a beta law. That of log s is
 // s^power told^reference on (floor, cap), told^2 = mean over the rows of (1 - posterior variance / (s^2 / 3))^2: the square
 // root of what a row tells of log s (Jeffreys) and a power, 0 where the noise drowns and steady where it is seen. It has
-// no scale of its own. What other data have told is a term pull'u - u'precision u / 2 beside it, u = s^warp. log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the
-// four lanes one holds phi, three hold phi + h e_j, whose slopes give three columns of the Hessian, other coordinates at
-// the next step. Around the mode, `nodes` points phi + H^(-1/2) z_k are evaluated and weighted by evidence over
+// no scale of its own. What other data have told is a term pull'u - u'precision u / 2 beside it, u = s^warp.
+// log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the lanes one holds phi, the others
+// phi + h e_j, whose slopes give columns of the Hessian, other coordinates at the next step where there are more
+// coordinates than lanes. Around the mode, `nodes` points phi + H^(-1/2) z_k are evaluated and weighted by evidence over
 // proposal; the answer is their mixture. A half-width that may as well be 0 has an exponential tail in log s and none in a
 // power of s, so the search and the nodes live in u = s^warp (its density has the prior s^(a-warp) in log s, and at its
 // mode the two Hessians differ by du/dphi only). Sites follow phi from point to point, so a point costs few sweeps.
@@ -20,18 +21,18 @@
 namespace hw {
 namespace HW_ISA {
 
-constexpr int ep_free = 16;  // most free parameters
+constexpr int ep_free = 16;   // most free parameters
+constexpr int ep_alone = 10;  // sweeps of a chain with its bounds alone, which starts afresh
+constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
 template <class N>
 struct EpLearner {
     Ep<N>& ep;
     const EpLearnArgs& a;
     EpFound f{};
-    V *keep_m = nullptr, *keep_D = nullptr, *keep_tau = nullptr, *keep_nu = nullptr;  // sites of the best point
-    V* was = nullptr;                         // (groups,)
-    Ep<N>* outside = nullptr;                 // bounds alone, or null
+    double *keep_m = nullptr, *keep_D = nullptr, *keep_tau = nullptr, *keep_nu = nullptr;  // sites of the best point
+    Ep<N>* outside = nullptr;       // bounds alone, or null
     EpFound fo{};
-    V *out_m = nullptr, *out_D = nullptr, *out_tau = nullptr, *out_nu = nullptr;  // its sites of the best point
     int q = 0;                                // parameters
     int group[ep_free] = {};                  // half-width of a parameter, -1: the rate
     double lo[ep_free] = {}, hi[ep_free] = {};
@@ -113,68 +114,112 @@ struct EpLearner {
             } else ep.s.eps.set(l, 1.0 / (1.0 + std::exp(-phi[j])));
         }
     }
-    void remember(int l) {
+    // ---- sites follow the parameters: log-linear in D and tau, linear in means ------------------------------------
+
+    // lead[(site * 2 + i) * q + j] = d (log precision, mean) / d phi_j of the site, w's first, then the rows'
+    double* lead = nullptr;
+    double kept[ep_free] = {};      // parameters of the sites that are kept
+    bool followed[ep_free] = {};    // lead was measured; else sites keep their shape over their own half-width
+
+    int group_of(std::ptrdiff_t site) const {
+        const std::ptrdiff_t k = site - stage_count();
+        if (k < 0) return site < ep.n ? -1 : a.base.group_w[site % ep.n];
+        return a.base.kind[k] == noise_gaussian || a.base.kind[k] == ep_truncation ? -1 : a.base.group[k];
+    }
+    // a row with two explanations may change between them: its site is not led along
+    bool steady(std::ptrdiff_t site) const {
+        const std::ptrdiff_t k = site - stage_count();
+        return k < 0 || a.base.kind[k] < noise_contaminated || a.base.kind[k] == ep_truncation;
+    }
+    // keep the sites of lane l, which belong to phi
+    void remember(int l, const double* phi) {
         for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
-            keep_m[k] = V(ep.s.m[k][l]);
-            keep_D[k] = V(ep.s.D[k][l]);
+            keep_m[k] = ep.s.m[k][l];
+            keep_D[k] = ep.s.D[k][l];
         }
         for (int k = 0; k < a.base.rows; k++) {
-            keep_tau[k] = V(ep.s.tau[k][l]);
-            keep_nu[k] = V(ep.s.nu[k][l]);
+            keep_tau[k] = ep.s.tau[k][l];
+            keep_nu[k] = ep.s.nu[k][l];
         }
-        for (int g = 0; g < a.base.groups; g++) was[g] = V(ep.s.s[g][l]);
-        if (outside) remember_outside(l);
+        keep(phi);
     }
-    void remember_outside(int l) {
-        for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
-            out_m[k] = V(outside->s.m[k][l]);
-            out_D[k] = V(outside->s.D[k][l]);
-        }
-        for (int k = 0; k < outside->a.rows; k++) {
-            out_tau[k] = V(outside->s.tau[k][l]);
-            out_nu[k] = V(outside->s.nu[k][l]);
+    void keep(const double* phi) {
+        const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
+        for (int j = 0; j < q; j++) {
+            kept[j] = phi[j];
+            for (std::ptrdiff_t site = 0; site < sites; site++) {
+                if (followed[j] && steady(site)) continue;
+                const bool own = group[j] >= 0 && group_of(site) == group[j];
+                const std::ptrdiff_t k = site - stages;
+                const double mean = k < 0 ? keep_m[site] : keep_tau[k] > 0.0 ? keep_nu[k] / keep_tau[k] : 0.0;
+                lead[2 * site * q + j] = own ? -2.0 : 0.0;
+                lead[(2 * site + 1) * q + j] = own ? mean : 0.0;
+            }
         }
     }
-    // every lane starts from the remembered sites, drawn along with its own half-widths
-    void recall() {
-        for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
-            ep.s.m[k] = keep_m[k];
-            ep.s.D[k] = keep_D[k];
+    // measure how the sites follow: lane l has parameter along[l] moved by h[l] from those of lane 0
+    void follow(const int* along, const double* h, const double* value) {
+        const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
+        V over(0.0);
+        int lane[wide_lanes], count = 0;
+        for (int l = 1; l < wide_lanes; l++)
+            if (along[l] >= 0 && value[l] > minus_inf) {
+                over.set(l, 1.0 / h[l]);
+                followed[along[l]] = true;
+                lane[count++] = l;
+            }
+        for (std::ptrdiff_t site = 0; site < sites; site++) {
+            if (!steady(site)) continue;
+            const std::ptrdiff_t k = site - stages;
+            const V own = k < 0 ? ep.s.D[site] : ep.s.tau[k];
+            V turn(0.0), move(0.0);
+            if (own[0] > 0.0) {
+                const V log_own = log_of(own), mean = k < 0 ? ep.s.m[site] : ep.s.nu[k] / larger(own, V(1e-300));
+                turn = (log_own - V(log_own[0])) * over * V(k < 0 ? -1.0 : 1.0);
+                move = (mean - V(mean[0])) * over;
+                turn = V::of(own.v > X{} ? max4(min4(turn.v, all<X>(20.0)), all<X>(-20.0)) : X{});
+                move = V::of(own.v > X{} ? move.v : X{});
+            }
+            for (int c = 0; c < count; c++) {
+                lead[2 * site * q + along[lane[c]]] = turn[lane[c]];
+                lead[(2 * site + 1) * q + along[lane[c]]] = move[lane[c]];
+            }
         }
-        for (int k = 0; k < a.base.rows; k++) {
-            ep.s.tau[k] = keep_tau[k];
-            ep.s.nu[k] = keep_nu[k];
-        }
-        ep.rescale(was);
-        if (dirty) ep.forget();
-        dirty = false;
-        if (!outside) return;
-        for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
-            outside->s.m[k] = out_m[k];
-            outside->s.D[k] = out_D[k];
-        }
-        for (int k = 0; k < outside->a.rows; k++) {
-            outside->s.tau[k] = out_tau[k];
-            outside->s.nu[k] = out_nu[k];
-        }
-        outside->rescale(was);
-        outside->forget();
     }
-    void begin() {
-        ep.start();
-        if (outside) outside->start();
-        dirty = false;
+    // every lane starts from the sites that are kept, drawn along to its own parameters
+    void recall(const double (*phi)[ep_free]) {
+        const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
+        V d[ep_free];
+        for (int j = 0; j < q; j++)
+            for (int l = 0; l < wide_lanes; l++) d[j].set(l, phi[l][j] - kept[j]);
+        for (std::ptrdiff_t site = 0; site < sites; site++) {
+            const std::ptrdiff_t k = site - stages;
+            const double own = k < 0 ? keep_D[site] : keep_tau[k];
+            V turn(0.0), mean(k < 0 ? keep_m[site] : own > 0.0 ? keep_nu[k] / own : 0.0);
+            if (own > 0.0 && (k < 0 || a.base.kind[k] != noise_gaussian))
+                for (int j = 0; j < q; j++) {
+                    turn += V(lead[2 * site * q + j]) * d[j];
+                    mean += V(lead[(2 * site + 1) * q + j]) * d[j];
+                }
+            turn = V::of(exp4(max4(min4(turn.v, all<X>(6.0)), all<X>(-6.0))));
+            if (k < 0) {
+                ep.s.D[site] = V(own) / turn;
+                ep.s.m[site] = mean;
+            } else {
+                ep.s.tau[k] = V(own) * turn;
+                ep.s.nu[k] = ep.s.tau[k] * mean;
+            }
+        }
+        ep.hear();
     }
-    bool dirty = false;  // the message may hold what is not finite
 
     // evaluate the lanes; value[l] = log posterior up to a constant, slope[l][j]
     void evaluate(const double (*phi)[ep_free], int most, double tol, double* value, double (*slope)[ep_free]) {
         sweeps += ep.settle(f, most, tol, a.base.damping);
         ep.look(f);
         sweeps++;
-        for (int l = 0; l < lanes; l++) {
+        for (int l = 0; l < wide_lanes; l++) {
             const bool sound = ep.sound(f, l);
-            if (!sound) dirty = true;
             value[l] = sound ? f.log_z[l] + log_prior(phi[l], l) : minus_inf;
             for (int j = 0; j < q; j++)
                 slope[l][j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l] + prior_slope(j, phi[l], l);
@@ -185,13 +230,14 @@ struct EpLearner {
     void evaluate_inside(const double (*phi)[ep_free], int most, double tol, double* value, double (*slope)[ep_free],
                          bool first) {
         if (outside) {
-            sweeps += outside->settle(fo, most, max2(tol, a.tol), a.base.damping) + 1;
+            outside->start();
+            sweeps += outside->settle(fo, most > ep_alone ? most : ep_alone, max2(tol, a.tol), a.base.damping) + 1;
             outside->look(fo);
         }
         evaluate(phi, most, tol, value, slope);
         if (outside && first && value[0] > minus_inf && !outside->sound(fo, 0)) outside = nullptr;
         if (!outside) return;
-        for (int l = 0; l < lanes; l++) {
+        for (int l = 0; l < wide_lanes; l++) {
             if (!outside->sound(fo, l)) value[l] = minus_inf;
             value[l] -= a.condition * fo.log_z[l];
             for (int j = 0; j < q; j++)
@@ -260,6 +306,13 @@ struct EpLearner {
         return far;
     }
 
+    // little is left to be known of the parameters, or no more is asked for: one node does
+    bool alone(const double (*H)[ep_free]) const {
+        double wide = 0.0;
+        for (int j = 0; j < q; j++) wide = max2(wide, 1.0 / std::sqrt(H[j][j]));
+        return q == 0 || wide < a.narrow || a.nodes == 1;
+    }
+
     // climb from phi to the mode; H at the end; returns 0, 1: not converged, 2: no sound point
     int climb(double* phi, double (*H)[ep_free], double* best, bool warm) {
         double column[ep_free][ep_free] = {}, g[ep_free] = {};
@@ -274,10 +327,11 @@ struct EpLearner {
         double length = 1e9;
         int refused = 0;
         for (int k = 0; k < a.steps; k++) {
-            double at[lanes][ep_free], value[lanes], slope[lanes][ep_free], h[lanes] = {};
-            int along[lanes] = {-1, -1, -1, -1};
+            double at[wide_lanes][ep_free], value[wide_lanes], slope[wide_lanes][ep_free], h[wide_lanes] = {};
+            int along[wide_lanes];
+            for (int& j : along) j = -1;
             for (int j = 0; j < q; j++) trial[j] = min2(max2(phi[j] + d[j], lo[j]), hi[j]);
-            for (int l = 0; l < lanes; l++) {
+            for (int l = 0; l < wide_lanes; l++) {
                 for (int j = 0; j < q; j++) at[l][j] = trial[j];
                 if (l == 0 || l > q) continue;
                 const int j = next;
@@ -287,16 +341,14 @@ struct EpLearner {
                 along[l] = j;
                 at[l][j] += h[l];
             }
-            for (int l = 0; l < lanes; l++) put(l, at[l]);
-            if (k > 0 || warm) recall();
-            else begin();
+            for (int l = 0; l < wide_lanes; l++) put(l, at[l]);
+            if (k > 0 || warm) recall(at);
+            else ep.start();
             evaluate_inside(at, k > 0 || warm ? a.few : a.many, a.tol, value, slope, *best == minus_inf);
             if (!(value[0] > *best - 0.05 * q) && refused < 6) {  // too far, or no trajectory fits
                 refused++;
                 if (*best == minus_inf) {  // the start itself: wider half-widths fit more
                     for (int j = 0; j < q; j++) phi[j] = min2(max2(phi[j] + (group[j] >= 0 ? 0.7 : 0.0), lo[j]), hi[j]);
-                    begin();
-                    remember(0);
                     warm = false;
                     k = -1;
                     if (refused == 6) return 2;
@@ -313,7 +365,7 @@ struct EpLearner {
                 phi[j] = trial[j];
                 g[j] = slope[0][j];
             }
-            for (int l = 1; l < lanes; l++)
+            for (int l = 1; l < wide_lanes; l++)
                 if (along[l] >= 0 && value[l] > minus_inf) {
                     for (int i = 0; i < q; i++) column[along[l]][i] = -(slope[l][i] - slope[0][i]) / h[l];
                     // an unmeasured column mirrors a measured one
@@ -322,10 +374,11 @@ struct EpLearner {
                     if (!measured[along[l]]) missing--;
                     measured[along[l]] = true;
                 }
-            remember(0);
+            remember(0, phi);
+            follow(along, h, value);
             hessian(column, H);
             length = step(H, phi, g, d);
-            if (length < a.close && missing == 0) return 0;
+            if (length < (alone(H) ? min2(a.close, ep_near) : a.close) && missing == 0) return 0;
         }
         return length < 1.0 ? 0 : 1;
     }
@@ -387,7 +440,7 @@ struct EpLearner {
             const double start = group[j] >= 0 ? std::log(max2(a.start[group[j]], 1e-300)) : a.start_eps;
             phi[j] = min2(max2(start, lo[j]), hi[j]);
         }
-        for (int l = 0; l < lanes; l++) {
+        for (int l = 0; l < wide_lanes; l++) {
             for (int g = 0; g < b.groups; g++) {
                 ep.s.s[g].set(l, a.start[g]);
                 if (outside) outside->s.s[g].set(l, a.start[g]);
@@ -397,20 +450,17 @@ struct EpLearner {
         }
         const bool warm = b.warm;
         if (warm) {
+            double from[ep_free];
             for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
-                keep_m[k] = V(b.m[k]);
-                keep_D[k] = V(b.D[k]);
+                keep_m[k] = b.m[k];
+                keep_D[k] = b.D[k];
             }
             for (int k = 0; k < b.rows; k++) {
-                keep_tau[k] = V(b.tau[k]);
-                keep_nu[k] = V(b.nu[k]);
+                keep_tau[k] = b.tau[k];
+                keep_nu[k] = b.nu[k];
             }
-            for (int g = 0; g < b.groups; g++) was[g] = V(a.was[g]);
-            ep.forget();
-            if (outside) {
-                outside->start();
-                remember_outside(0);
-            }
+            for (int j = 0; j < q; j++) from[j] = group[j] >= 0 ? std::log(max2(a.was[group[j]], 1e-300)) : phi[j];
+            keep(from);
         }
         const EpCross wanted = ep.cross;
         ep.cross = EpCross{};
@@ -422,14 +472,14 @@ struct EpLearner {
             if (code == 2) return 2;
             for (double keep = 1.0; !factor(H, keep, L); keep *= 0.7) {}
         } else {
-            double at[lanes][ep_free] = {}, value[lanes], slope[lanes][ep_free];
-            if (warm) recall();
-            else begin();
+            double at[wide_lanes][ep_free] = {}, value[wide_lanes], slope[wide_lanes][ep_free];
+            if (warm) recall(at);
+            else ep.start();
             evaluate_inside(at, a.most, a.tol_nodes, value, slope, true);
             if (value[0] == minus_inf) return 2;
             best = value[0];
             if (!(f.residual[0] < a.tol_nodes)) code = 1;
-            remember(0);
+            remember(0, phi);
         }
         for (int j = 0; j < q; j++) {
             a.mode[j] = phi[j];
@@ -437,17 +487,14 @@ struct EpLearner {
         }
         // sites of the mode, for a warm start
         for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
-            b.m[k] = keep_m[k][0];
-            b.D[k] = keep_D[k][0];
+            b.m[k] = keep_m[k];
+            b.D[k] = keep_D[k];
         }
         for (int k = 0; k < b.rows; k++) {
-            b.tau[k] = keep_tau[k][0];
-            b.nu[k] = keep_nu[k][0];
+            b.tau[k] = keep_tau[k];
+            b.nu[k] = keep_nu[k];
         }
-        // Little is left to be known of the parameters: one node does.
-        double wide = 0.0;
-        for (int j = 0; j < q; j++) wide = max2(wide, 1.0 / std::sqrt(H[j][j]));
-        const int nodes = q == 0 || wide < a.narrow ? 1 : a.nodes;
+        const int nodes = alone(H) ? 1 : a.nodes;
         *a.used = nodes;
         ep.cross = wanted;
         const std::ptrdiff_t size = stage_count();
@@ -458,10 +505,10 @@ struct EpLearner {
         double top = minus_inf, sum = 0.0;
         *a.residual = 0.0;
         bool first = true;
-        for (int k = 0; k < nodes; k += lanes) {
-            double at[lanes][ep_free], value[lanes], slope[lanes][ep_free];
-            bool inside[lanes];
-            for (int l = 0; l < lanes; l++) {
+        for (int k = 0; k < nodes; k += wide_lanes) {
+            double at[wide_lanes][ep_free], value[wide_lanes], slope[wide_lanes][ep_free];
+            bool inside[wide_lanes];
+            for (int l = 0; l < wide_lanes; l++) {
                 inside[l] = k + l < nodes;
                 for (int j = 0; j < q; j++) at[l][j] = phi[j];
                 if (nodes > 1 && inside[l]) {
@@ -481,10 +528,10 @@ struct EpLearner {
                 }
                 put(l, at[l]);
             }
-            recall();
+            recall(at);
             evaluate_inside(at, a.most, a.tol_nodes, value, slope, false);
             ep.shapes(b.k3, b.k4);
-            for (int l = 0; l < lanes && k + l < nodes; l++) {
+            for (int l = 0; l < wide_lanes && k + l < nodes; l++) {
                 for (int j = 0; j < q; j++) {
                     a.phi[(k + l) * q + j] = at[l][j];
                     a.node_slope[(k + l) * q + j] = f.slope[group[j] >= 0 ? group[j] : b.groups][l];

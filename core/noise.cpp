@@ -1,4 +1,5 @@
 // Entry points of core/noise.hpp for arrays.
+#include "lanes.hpp"
 #include "noise.hpp"
 #include "noise_entry.hpp"
 
@@ -6,33 +7,36 @@ namespace hw {
 namespace HW_ISA {
 namespace {
 
-// lanes k .. k+3 of an array, `rest` beyond its end
-inline V4 four(const double* p, std::size_t k, std::size_t size, double rest) {
-    V4 v = all4(rest);
-    for (std::size_t l = 0; l < lanes && k + l < size; l++) v[static_cast<int>(l)] = p[k + l];
+// as many lanes as the kernels of the widest registers have
+typedef Lanes<wide_lanes>::Raw X;
+
+// lanes k, k+1, ... of an array, `rest` beyond its end
+inline X some(const double* p, std::size_t k, std::size_t size, double rest) {
+    X v = all<X>(rest);
+    for (std::size_t l = 0; l < wide_lanes && k + l < size; l++) v[static_cast<int>(l)] = p[k + l];
     return v;
 }
 
-inline void put(double* p, std::size_t k, std::size_t size, V4 v) {
-    for (std::size_t l = 0; l < lanes && k + l < size; l++) p[k + l] = v[static_cast<int>(l)];
+inline void put(double* p, std::size_t k, std::size_t size, X v) {
+    for (std::size_t l = 0; l < wide_lanes && k + l < size; l++) p[k + l] = v[static_cast<int>(l)];
 }
 
-inline Tilted4 tilted(int kind, V4 mu, V4 c, V4 s, V4 R, V4 eps, V4 extra) {
+inline Tilted<X> tilted(int kind, const Cavity<X>& q, X s, X R, X eps, X extra) {
     switch (kind) {
-        case noise_gaussian: return gaussian4(mu, c, R);
-        case noise_uniform: return uniform4(mu, c, s);
-        case noise_uniform_gaussian: return uniform_gaussian4(mu, c, s, R);
-        case noise_contaminated: return contaminated4(mu, c, s, R, eps, extra);
-        default: return maybe_lost4(mu, c, s, R, eps, extra);
+        case noise_gaussian: return gaussian4<evidence>(q, R);
+        case noise_uniform: return uniform4<evidence>(q, s);
+        case noise_uniform_gaussian: return uniform_gaussian4<evidence>(q, s, R);
+        case noise_contaminated: return contaminated4<evidence>(q, s, R, eps, extra);
+        default: return maybe_lost4<evidence>(q, s, R, eps, extra);
     }
 }
 
 }  // namespace
 
 void noise_truncated(const TruncatedArgs& a) {
-    for (std::size_t k = 0; k < a.size; k += lanes) {
-        const Truncated4 t = truncated4(four(a.mu, k, a.size, 0.0), four(a.c, k, a.size, 1.0),
-                                        four(a.lo, k, a.size, -1.0), four(a.hi, k, a.size, 1.0));
+    for (std::size_t k = 0; k < a.size; k += wide_lanes) {
+        const Truncated<X> t = truncated4(some(a.mu, k, a.size, 0.0), some(a.c, k, a.size, 1.0),
+                                        some(a.lo, k, a.size, -1.0), some(a.hi, k, a.size, 1.0));
         put(a.log_z, k, a.size, t.log_z);
         put(a.log_mean, k, a.size, t.log_mean);
         put(a.mean, k, a.size, t.mean);
@@ -43,9 +47,9 @@ void noise_truncated(const TruncatedArgs& a) {
 }
 
 void noise_tilted(const TiltedArgs& a) {
-    for (std::size_t k = 0; k < a.size; k += lanes) {
-        const Tilted4 t = tilted(a.kind, four(a.mu, k, a.size, 0.0), four(a.c, k, a.size, 1.0), four(a.s, k, a.size, 1.0),
-                                 four(a.R, k, a.size, 1.0), four(a.eps, k, a.size, 0.5), four(a.extra, k, a.size, 1.0));
+    for (std::size_t k = 0; k < a.size; k += wide_lanes) {
+        const Tilted<X> t = tilted(a.kind, cavity4(some(a.mu, k, a.size, 0.0), some(a.c, k, a.size, 1.0)), some(a.s, k, a.size, 1.0),
+                                 some(a.R, k, a.size, 1.0), some(a.eps, k, a.size, 0.5), some(a.extra, k, a.size, 1.0));
         put(a.log_z, k, a.size, t.log_z);
         put(a.mean, k, a.size, t.mean);
         put(a.var, k, a.size, t.var);

@@ -18,48 +18,55 @@
 #pragma once
 
 #include "lane.hpp"
-
-#if defined(__AVX__)
-#include <immintrin.h>
-#endif
+#include "wide.hpp"
 
 namespace hw {
 namespace HW_ISA {
 
-struct Truncated4 {
-    V4 log_z;         // log of the Gaussian's mass in the box
-    V4 log_mean;      // log of the Gaussian's mean density in the box; minus infinity for an endless box
-    V4 mean, var;     // tilted
-    V4 at_lo, at_hi;  // tilted density at the ends: -d log Z / d lo, d log Z / d hi
+template <class X>
+struct Truncated {
+    X log_z;         // log of the Gaussian's mass in the box
+    X log_mean;      // log of the Gaussian's mean density in the box; minus infinity for an endless box
+    X mean, var;     // tilted
+    X at_lo, at_hi;  // tilted density at the ends: -d log Z / d lo, d log Z / d hi
+    X k3, k4;        // cumulants
 };
+typedef Truncated<V4> Truncated4;
 
 // What a noise makes of its cavity; slope[k] = d log Z / d log (parameter k), or d logit of a rate.
-struct Tilted4 {
-    V4 log_z, mean, var;
-    V4 slope_s;    // of the half-width
-    V4 slope_R;    // of the variance
-    V4 slope_eps;  // of the rate of outliers or losses, by its logit
-    V4 out;        // probability that the row is an outlier or lost
+template <class X>
+struct Tilted {
+    X log_z, mean, var;
+    X slope_s;    // of the half-width
+    X slope_R;    // of the variance
+    X slope_eps;  // of the rate of outliers or losses, by its logit
+    X out;        // probability that the row is an outlier or lost
+    X k3, k4;     // cumulants
 };
 
-inline V4 min4(V4 a, V4 b) { return a < b ? a : b; }
-inline V4 abs4(V4 a) { return max4(a, -a); }
-inline V4 sqrt4(V4 a) {
-#if defined(__AVX__)
-    return V4(_mm256_sqrt_pd((__m256d)a));
-#else
-    return V4{std::sqrt(a[0]), std::sqrt(a[1]), std::sqrt(a[2]), std::sqrt(a[3])};
-#endif
+// A cavity N(mu, c) with what its maker has at hand: sd^2 = c, scale = 1 / sd.
+template <class X>
+struct Cavity {
+    X mu, c, sd, scale;
+};
+template <class X>
+inline Cavity<X> cavity4(X mu, X c) {
+    const X sd = sqrt4(min4(max4(c, all<X>(1e-300)), all<X>(1e300)));
+    return {mu, c, sd, 1.0 / sd};
 }
 
-// sum of p[k] y^k, even and odd powers side by side
-template <int D>
-inline V4 polynomial4(const double (&p)[D], V4 y) {
-    const V4 y2 = y * y;
-    V4 even = all4(p[(D - 1) / 2 * 2]), odd = all4(p[D / 2 * 2 - 1]);
-    for (int k = (D - 1) / 2 * 2 - 2; k >= 0; k -= 2) even = even * y2 + all4(p[k]);
-    for (int k = D / 2 * 2 - 3; k >= 0; k -= 2) odd = odd * y2 + all4(p[k]);
-    return even + y * odd;
+// sum of p[k] y^k, every fourth power a chain of its own
+template <int D, class X>
+inline X polynomial4(const double (&p)[D], X y) {
+    const X y2 = y * y, y4 = y2 * y2;
+    X part[4];
+    for (int c = 0; c < 4; c++) {
+        constexpr int whole = (D - 1) / 4 * 4;
+        const int top = whole + c < D ? whole + c : whole + c - 4;
+        part[c] = all<X>(p[top]);
+        for (int k = top - 4; k >= 0; k -= 4) part[c] = part[c] * y4 + all<X>(p[k]);
+    }
+    return (part[0] + y * part[1]) + y2 * (part[2] + y * part[3]);
 }
 
 constexpr double tail_0[] = {
@@ -88,14 +95,16 @@ constexpr double tail_2[] = {
     4.42895604305481659e-8, 2.2275669454504871e-7, 1.02824287489289391e-9, -1.92140920798082692e-8};
 
 // I_0, I_1, I_2 of the tail beyond a >= 0
-struct Tail4 {
-    V4 i0, i1, i2;
+template <class X>
+struct Tail {
+    X i0, i1, i2;
 };
 
 // near: by recurrence, for a <= 4 or where a factor exp(-a^2/2) follows; far: all three to full precision
-inline Tail4 tail4(V4 a, bool far) {
-    const V4 g = 1.0 / (a + 5.0), y = (a - 5.0) * g;
-    Tail4 r;
+template <class X>
+inline Tail<X> tail4(X a, bool far) {
+    const X g = 1.0 / (a + 5.0), y = (a - 5.0) * g;
+    Tail<X> r;
     r.i0 = g * polynomial4(tail_0, y);
     if (far) {
         r.i1 = g * g * polynomial4(tail_1, y);
@@ -107,229 +116,216 @@ inline Tail4 tail4(V4 a, bool far) {
     return r;
 }
 
-// N(mu, c) cut to [lo, hi]
-inline Truncated4 truncated4(V4 mu, V4 c, V4 lo, V4 hi) {
+// Over a width w about m across which the log density falls by a quarter at most: S[j] = the sum over the nodes of
+// exp(m^2/2 - x^2/2) t^j, t = (x - m) / w. Pairs of nodes make cosh and sinh of m (x - m), so series do.
+template <class X>
+inline void narrow4(X m, X w, X (&S)[5]) {
     // Gauss-Legendre on [-1/2, 1/2]
     constexpr double node[3] = {0.46623475710157597, 0.33060469323313224, 0.11930959304159845};
     constexpr double weight[3] = {0.08566224618958514, 0.18038078652406936, 0.23395696728634552};
+    constexpr double bell[9] = {1.0, -1.0, 1.0 / 2, -1.0 / 6, 1.0 / 24, -1.0 / 120, 1.0 / 720, -1.0 / 5040, 1.0 / 40320};
+    constexpr double even[5] = {1.0, 1.0 / 2, 1.0 / 24, 1.0 / 720, 1.0 / 40320};
+    constexpr double odd[5] = {1.0, 1.0 / 6, 1.0 / 120, 1.0 / 5040, 1.0 / 362880};
+    for (int j = 0; j < 5; j++) S[j] = X{};
+    for (int k = 0; k < 3; k++) {
+        const double t = node[k], t2 = t * t;
+        const X u = w * t, mu = m * u, y = mu * mu;
+        const X f = (2.0 * weight[k]) * polynomial4(bell, 0.5 * u * u);
+        const X g = f * polynomial4(even, y), h = f * mu * polynomial4(odd, y);
+        S[0] += g;
+        S[1] -= t * h;
+        S[2] += t2 * g;
+        S[3] -= t * t2 * h;
+        S[4] += t2 * t2 * g;
+    }
+}
+
+// How much is asked of a factor: mean and variance; evidence and slopes as well; third and fourth cumulant as well.
+enum Depth { moments, evidence, cumulants };
+
+// N(mu, c) cut to [lo, hi]
+template <int depth, class X>
+inline Truncated<X> cut4(const Cavity<X>& from, X lo, X hi) {
     constexpr double far = 1e90, half_log_2pi = 0.5 * log_2pi, root_2pi = 2.5066282746310005024;
-    const V4 zero{};
-    const V4 sd = sqrt4(min4(max4(c, all4(1e-300)), all4(1e300))), scale = 1.0 / sd;
-    const V4 width = hi - lo;
-    const V4 lower = min4(max4((lo - mu) * scale, all4(-far)), all4(far));
-    const V4 upper = min4(max4((hi - mu) * scale, all4(-far)), all4(far));
+    const X zero{}, sd = from.sd, scale = from.scale;
+    const X width = hi - lo;
+    const X lower = min4(max4((lo - from.mu) * scale, all<X>(-far)), all<X>(far));
+    const X upper = min4(max4((hi - from.mu) * scale, all<X>(-far)), all<X>(far));
     const auto flip = lower + upper < zero;
-    const V4 a = flip ? -upper : lower, b = flip ? -lower : upper;  // b >= |a|
-    const V4 w = min4(width * scale, all4(2.0 * far));
-    const V4 ref = max4(a, zero);  // where the Gaussian is highest in the box
+    const X a = flip ? -upper : lower, b = flip ? -lower : upper;  // b >= |a|
+    const X w = min4(width * scale, all<X>(2.0 * far));
+    const X ref = max4(a, zero);  // where the Gaussian is highest in the box
     const auto beyond = a >= zero;
-    const V4 drop = beyond ? w * (a + 0.5 * w) : 0.5 * b * b;
-    const V4 Ea = exp4(0.5 * (ref - a) * (ref + a)), Eb = exp4(-drop);  // densities at the ends over that at ref
-    const auto narrow = drop <= (beyond ? all4(0.25) : all4(0.03));
-    const bool any_narrow = narrow[0] | narrow[1] | narrow[2] | narrow[3];
-    const bool all_narrow = narrow[0] & narrow[1] & narrow[2] & narrow[3];
+    const X drop = beyond ? w * (a + 0.5 * w) : 0.5 * b * b;
+    const X Ea = exp4(0.5 * (ref - a) * (ref + a)), Eb = exp4(-drop);  // densities at the ends over that at ref
+    const auto narrow = drop <= (beyond ? all<X>(0.25) : all<X>(0.03));
 
-    V4 S0 = zero, S1 = zero, S2 = zero;  // narrow: moments of t = (z - middle) / width, over the mean density
-    if (any_narrow) {
-        const V4 shift = beyond ? a : zero, middle = 0.5 * (a + b);
-        for (int k = 0; k < 3; k++) {
-            // exponent -(x^2 - ref^2) / 2 at x = a + w (1/2 +- node), without the cancellation of large a
-            const V4 tp = w * (0.5 + node[k]), tm = w * (0.5 - node[k]);
-            const V4 xp = middle + w * node[k], xm = middle - w * node[k];
-            const V4 fp = exp4(beyond ? -tp * (shift + 0.5 * tp) : -0.5 * xp * xp);
-            const V4 fm = exp4(beyond ? -tm * (shift + 0.5 * tm) : -0.5 * xm * xm);
-            S0 += weight[k] * (fp + fm);
-            S1 += weight[k] * node[k] * (fp - fm);
-            S2 += weight[k] * node[k] * node[k] * (fp + fm);
+    const bool deep = any4((a > all<X>(4.0)) & ~narrow);
+    const Tail<X> A = tail4(abs4(a), deep), B = tail4(b, deep);
+    X Z = beyond ? A.i0 - Eb * B.i0 : root_2pi - Ea * A.i0 - Eb * B.i0;  // over the density at ref
+    const X over = 1.0 / Z, pa = Ea * over, pb = Eb * over;
+    // moments of the distance from the end a (or, inside, from mu), standardised
+    const X t1 = beyond ? (A.i1 - Eb * (w * B.i0 + B.i1)) * over : pa - pb;
+    const X t2 = beyond ? (A.i2 - Eb * (w * (w * B.i0 + 2.0 * B.i1) + B.i2)) * over : 1.0 + a * pa - b * pb;
+    const X v = min4(max4(t2 - t1 * t1, zero), all<X>(1.0));
+    const X sign = flip ? all<X>(-1.0) : all<X>(1.0), end = flip ? hi : lo;
+    X mean = (beyond ? end : from.mu) + sign * sd * t1, var = from.c * v;
+    Truncated<X> r;
+    if (depth == cumulants) {  // by parts; skewness and kurtosis of what is log-concave are bounded
+        const X t3 = 2.0 * t1 + (beyond ? -w * w * pb - a * t2 : a * a * pa - b * b * pb);
+        const X t4 = 3.0 * t2 + (beyond ? -w * w * w * pb - a * t3 : a * a * a * pa - b * b * b * pb);
+        const X v2 = v * v, m3 = t3 - 3.0 * t1 * t2 + 2.0 * t1 * t1 * t1;
+        const X m4 = t4 - 4.0 * t1 * t3 + 6.0 * t1 * t1 * t2 - 3.0 * t1 * t1 * t1 * t1;
+        const X most = 2.0 * v * sqrt4(v);
+        r.k3 = sign * sd * from.c * min4(max4(m3, -most), most);
+        r.k4 = from.c * from.c * min4(max4(m4 - 3.0 * v2, -1.2 * v2), 6.0 * v2);
+    }
+    X density = Z / w;  // mean one, over that at ref
+    if (any4(narrow)) {
+        const X m = beyond ? a + 0.5 * w : 0.5 * (a + b);
+        X S[5];
+        narrow4(m, w, S);
+        const X inverse = 1.0 / S[0], s1 = S[1] * inverse, s2 = S[2] * inverse, w2 = width * width;
+        const X own = max4(s2 - s1 * s1, zero);
+        mean = narrow ? end + sign * width * (0.5 + s1) : mean;
+        var = narrow ? w2 * own : var;
+        if (depth >= evidence) {
+            density = narrow ? S[0] * exp4(beyond ? -0.5 * w * (a + 0.25 * w) : -0.5 * m * m) : density;
+            Z = narrow ? w * density : Z;
+        }
+        if (depth == cumulants) {
+            const X s3 = S[3] * inverse, s4 = S[4] * inverse;
+            r.k3 = narrow ? sign * width * w2 * (s3 - 3.0 * s1 * s2 + 2.0 * s1 * s1 * s1) : r.k3;
+            r.k4 = narrow ? w2 * w2 * (s4 - 4.0 * s1 * s3 + 6.0 * s1 * s1 * s2 - 3.0 * s1 * s1 * s1 * s1 - 3.0 * own * own)
+                          : r.k4;
         }
     }
-    V4 Z = w * S0, t1 = zero, var = zero;  // Z over the density at ref; t1: mean from the end a (or from mu), standardised
-    if (!all_narrow) {
-        const auto deep = (a > all4(4.0)) & ~narrow;
-        const bool deep_tail = deep[0] | deep[1] | deep[2] | deep[3];
-        const Tail4 A = tail4(abs4(a), deep_tail), B = tail4(b, deep_tail);
-        const V4 tail_Z = A.i0 - Eb * B.i0, inside_Z = root_2pi - Ea * A.i0 - Eb * B.i0;
-        Z = narrow ? Z : beyond ? tail_Z : inside_Z;
-        const V4 over = 1.0 / Z, pa = Ea * over, pb = Eb * over;
-        const V4 tail_1st = (A.i1 - Eb * (w * B.i0 + B.i1)) * over;
-        const V4 tail_2nd = (A.i2 - Eb * (w * (w * B.i0 + 2.0 * B.i1) + B.i2)) * over;
-        t1 = beyond ? tail_1st : pa - pb;
-        var = beyond ? tail_2nd - tail_1st * tail_1st : 1.0 + a * pa - b * pb - t1 * t1;
-        var = min4(max4(var, zero), all4(1.0));
-    }
-    const V4 sign = flip ? all4(-1.0) : all4(1.0);
-    const V4 edge = flip ? hi : lo;
-    const V4 centre = S1 / S0;
-    const V4 mean = narrow ? edge + sign * width * (0.5 + centre) : (beyond ? edge : mu) + sign * sd * t1;
-    const V4 log_top = -0.5 * ref * ref - half_log_2pi;  // log density at ref, standardised
-    const V4 floor = all4(smallest);
-
-    Truncated4 r;
-    r.log_z = log_top + log4(Z);
-    const V4 mean_density = narrow ? S0 : Z / w;
-    r.log_mean = log_top + log4(mean_density) - log4(sd);
     r.mean = min4(max4(mean, lo), hi);
-    r.var = c > zero ? (narrow ? width * width * max4(S2 / S0 - centre * centre, zero) : sd * sd * var) : zero;
-    const V4 density = scale / max4(Z, floor), near = Ea * density, away = Eb * density;
-    r.at_lo = flip ? away : near;
-    r.at_hi = flip ? near : away;
+    r.var = from.c > zero ? var : zero;
+    if (depth >= evidence) {
+        const X log_top = -0.5 * ref * ref - half_log_2pi;  // log density at ref, standardised
+        r.log_z = log_top + log4(Z);
+        r.log_mean = log_top + log4(density) + log4(scale);
+        const X one = scale / max4(Z, all<X>(smallest)), near = Ea * one, away = Eb * one;
+        r.at_lo = flip ? away : near;
+        r.at_hi = flip ? near : away;
+    }
     return r;
 }
-
-// Third and fourth cumulant of a tilted distribution, and its central moments.
-struct Shape4 {
-    V4 mean, m2, m3, m4;
-    inline V4 k3() const { return m3; }
-    inline V4 k4() const { return m4 - 3.0 * m2 * m2; }
-};
-
-// of N(mu, c) cut to [lo, hi], by quadrature over the part that carries mass; about six digits
-inline Shape4 truncated_shape4(V4 mu, V4 c, V4 lo, V4 hi) {
-    constexpr double node[10] = {0.4965642995925475, 0.4819859636389569, 0.456117214125663, 0.4195584859111094,
-                                   0.3731659532300754, 0.3180268403632575, 0.25543350097541356, 0.18685304435770977,
-                                   0.11389292557082253, 0.03826326056674867};
-    constexpr double weight[10] = {0.008807003569575447, 0.020300714900193223, 0.031336024167054395, 0.04163837078835236,
-                                     0.05096505990862035, 0.0590972659807593, 0.06584431922458844, 0.0710480546591912,
-                                     0.07458649323630212, 0.07637669356536314};
-    const V4 zero{}, sd = sqrt4(min4(max4(c, all4(1e-300)), all4(1e300)));
-    const V4 lower = min4(max4((lo - mu) / sd, all4(-1e90)), all4(1e90));
-    const V4 upper = min4(max4((hi - mu) / sd, all4(-1e90)), all4(1e90));
-    const auto flip = lower + upper < zero;
-    const V4 a = flip ? -upper : lower, b = flip ? -lower : upper, ref = max4(a, zero);
-    const V4 left = max4(a, all4(-7.0));
-    const V4 width = min4(b - left, ref - left + 50.0 / (ref + sqrt4(ref * ref + 50.0)));
-    V4 s0 = zero, s1 = zero, s2 = zero, s3 = zero, s4 = zero;
-    for (int k = 0; k < 10; k++)
-        for (int side = -1; side <= 1; side += 2) {
-            const V4 t = width * (0.5 + side * node[k]);
-            const V4 d = left - ref;  // x^2 - ref^2 = (t + d) (t + d + 2 ref)
-            const V4 f = weight[k] * exp4(-0.5 * (t + d) * (t + d + 2.0 * ref)), u = all4(side * node[k]);
-            s0 += f;
-            s1 += f * u;
-            s2 += f * u * u;
-            s3 += f * u * u * u;
-            s4 += f * u * u * u * u;
-        }
-    const V4 over = 1.0 / max4(s0, all4(smallest)), m = s1 * over, q2 = s2 * over, q3 = s3 * over, q4 = s4 * over;
-    const V4 unit = sd * width, sign = flip ? all4(-1.0) : all4(1.0);
-    const V4 v = max4(q2 - m * m, zero);
-    Shape4 r;
-    r.mean = min4(max4((flip ? mu - sd * left : mu + sd * left) + sign * unit * (0.5 + m), lo), hi);
-    r.m2 = unit * unit * v;
-    r.m3 = sign * unit * unit * unit * (q3 - 3.0 * m * q2 + 2.0 * m * m * m);
-    r.m4 = unit * unit * unit * unit * max4(q4 - 4.0 * m * q3 + 6.0 * m * m * q2 - 3.0 * m * m * m * m, zero);
-    return r;
+template <class X>
+inline Truncated<X> truncated4(X mu, X c, X lo, X hi) {
+    return cut4<evidence>(cavity4(mu, c), lo, hi);
 }
 
-// of a uniform on [-s, s] plus N(0, R)
-inline Shape4 uniform_gaussian_shape4(V4 mu, V4 c, V4 s, V4 R) {
-    const V4 V = max4(c + R, all4(1e-300)), gain = c / V, g2 = gain * gain;
-    const Shape4 t = truncated_shape4(mu, V, -s, s);
-    Shape4 r;
-    r.mean = mu + gain * (t.mean - mu);
-    r.m2 = gain * R + g2 * t.m2;
-    r.m3 = g2 * gain * t.k3();
-    r.m4 = g2 * g2 * t.k4() + 3.0 * r.m2 * r.m2;
-    return r;
+// d over the standard deviation, held where its square would overflow
+template <class X>
+inline X standardised4(X d, X scale) {
+    return min4(max4(d * scale, all<X>(-1e90)), all<X>(1e90));
 }
-
-inline Shape4 gaussian_shape4(V4 mu, V4 c, V4 R) {
-    const V4 V = max4(c + R, all4(1e-300));
-    Shape4 r{};
-    r.mean = mu * (R / V);
-    r.m2 = c * (R / V);
-    r.m4 = 3.0 * r.m2 * r.m2;
-    return r;
-}
-
-// of two explanations, the second with probability p
-inline Shape4 mixture_shape4(const Shape4& f, const Shape4& g, V4 p) {
-    const V4 one = 1.0 - p, mean = one * f.mean + p * g.mean, a = f.mean - mean, b = g.mean - mean;
-    Shape4 r;
-    r.mean = mean;
-    r.m2 = one * (f.m2 + a * a) + p * (g.m2 + b * b);
-    r.m3 = one * (f.m3 + 3.0 * a * f.m2 + a * a * a) + p * (g.m3 + 3.0 * b * g.m2 + b * b * b);
-    r.m4 = one * (f.m4 + 4.0 * a * f.m3 + 6.0 * a * a * f.m2 + a * a * a * a) +
-           p * (g.m4 + 4.0 * b * g.m3 + 6.0 * b * b * g.m2 + b * b * b * b);
-    return r;
-}
-
-// d / sqrt(V), held where its square would overflow
-inline V4 standardised4(V4 d, V4 V) { return min4(max4(d / sqrt4(V), all4(-1e90)), all4(1e90)); }
 
 // f = N(z; 0, R): exact
-inline Tilted4 gaussian4(V4 mu, V4 c, V4 R) {
-    const V4 V = max4(c + R, all4(1e-300)), share = R / V;
-    Tilted4 r{};
-    const V4 d = standardised4(mu, V), q = d * d;
-    r.log_z = -0.5 * (log_2pi + log4(V) + q);
-    r.mean = mu * share;
-    r.var = c * share;
-    r.slope_R = 0.5 * share * (q - 1.0);
+template <int depth, class X>
+inline Tilted<X> gaussian4(const Cavity<X>& q, X R) {
+    const X over = 1.0 / max4(q.c + R, all<X>(1e-300)), share = R * over;
+    Tilted<X> r{};
+    r.mean = q.mu * share;
+    r.var = q.c * share;
+    if (depth >= evidence) {
+        const X d = standardised4(q.mu, sqrt4(over)), d2 = d * d;
+        r.log_z = -0.5 * (log_2pi - log4(over) + d2);
+        r.slope_R = 0.5 * share * (d2 - 1.0);
+    }
     return r;
 }
 
 // f = uniform on [-s, s]; s = 0 is the point 0
-inline Tilted4 uniform4(V4 mu, V4 c, V4 s) {
-    const Truncated4 t = truncated4(mu, c, -s, s);
-    Tilted4 r{};
-    r.log_z = t.log_mean;
+template <int depth, class X>
+inline Tilted<X> uniform4(const Cavity<X>& q, X s) {
+    const Truncated<X> t = cut4<depth>(q, -s, s);
+    Tilted<X> r{};
     r.mean = t.mean;
     r.var = t.var;
-    r.slope_s = s > V4{} ? s * (t.at_lo + t.at_hi) - 1.0 : V4{};
+    if (depth >= evidence) {
+        r.log_z = t.log_mean;
+        r.slope_s = s > X{} ? s * (t.at_lo + t.at_hi) - 1.0 : X{};
+    }
+    if (depth == cumulants) {
+        r.k3 = t.k3;
+        r.k4 = t.k4;
+    }
     return r;
 }
 
 // f = uniform on [-s, s] plus N(0, R): v = z + noise is N(mu, c + R) cut to the box, and z given v is Gaussian
-inline Tilted4 uniform_gaussian4(V4 mu, V4 c, V4 s, V4 R) {
-    const V4 V = max4(c + R, all4(1e-300)), gain = c / V;
-    const Truncated4 t = truncated4(mu, V, -s, s);
-    Tilted4 r{};
-    r.log_z = t.log_mean;
-    const V4 d = t.mean - mu;
-    r.mean = mu + gain * d;
+template <int depth, class X>
+inline Tilted<X> uniform_gaussian4(const Cavity<X>& q, X s, X R) {
+    const Cavity<X> sum = cavity4(q.mu, max4(q.c + R, all<X>(1e-300)));
+    const X over = sum.scale * sum.scale, gain = q.c * over;
+    const Truncated<X> t = cut4<depth>(sum, -s, s);
+    Tilted<X> r{};
+    const X d = t.mean - q.mu;
+    r.mean = q.mu + gain * d;
     r.var = gain * (R + gain * t.var);
-    r.slope_s = s > V4{} ? s * (t.at_lo + t.at_hi) - 1.0 : V4{};
-    const V4 q = standardised4(d, V);
-    r.slope_R = 0.5 * (R / V) * (q * q + t.var / V - 1.0);
+    if (depth >= evidence) {
+        r.log_z = t.log_mean;
+        r.slope_s = s > X{} ? s * (t.at_lo + t.at_hi) - 1.0 : X{};
+        const X e = standardised4(d, sum.scale);
+        r.slope_R = 0.5 * (R * over) * (e * e + t.var * over - 1.0);
+    }
+    if (depth == cumulants) {
+        r.k3 = gain * gain * gain * t.k3;
+        r.k4 = gain * gain * gain * gain * t.k4;
+    }
     return r;
 }
 
 // two explanations of one row, the second with probability eps
-inline Tilted4 mixture4(const Tilted4& f, const Tilted4& g, V4 eps) {
-    const V4 one = f.log_z + log4(1.0 - eps), two = g.log_z + log4(eps);
-    const V4 top = max4(one, two), low = min4(one, two);
-    const V4 e = exp4(low - top), less = e / (1.0 + e);
-    const V4 p = two > one ? 1.0 - less : less;
-    Tilted4 r;
+template <int depth, class X>
+inline Tilted<X> mixture4(const Tilted<X>& f, const Tilted<X>& g, X eps) {
+    const X one = f.log_z + log4(1.0 - eps), two = g.log_z + log4(eps);
+    const X top = max4(one, two), low = min4(one, two);
+    const X e = exp4(low - top), less = e / (1.0 + e);
+    const X p = two > one ? 1.0 - less : less, rest = 1.0 - p;
+    Tilted<X> r{};
     r.log_z = top + log4(1.0 + e);
-    const V4 d = g.mean - f.mean;
+    const X d = g.mean - f.mean;
     r.mean = f.mean + p * d;
-    r.var = (1.0 - p) * f.var + p * g.var + p * (1.0 - p) * d * d;
-    r.slope_s = (1.0 - p) * f.slope_s + p * g.slope_s;
-    r.slope_R = (1.0 - p) * f.slope_R + p * g.slope_R;
+    r.var = rest * f.var + p * g.var + p * rest * d * d;
+    r.slope_s = rest * f.slope_s + p * g.slope_s;
+    r.slope_R = rest * f.slope_R + p * g.slope_R;
     r.slope_eps = p - eps;
     r.out = p;
+    if (depth == cumulants) {
+        const X a = f.mean - r.mean, b = g.mean - r.mean;
+        const X f4 = f.k4 + 3.0 * f.var * f.var, g4 = g.k4 + 3.0 * g.var * g.var;
+        r.k3 = rest * (f.k3 + 3.0 * a * f.var + a * a * a) + p * (g.k3 + 3.0 * b * g.var + b * b * b);
+        r.k4 = rest * (f4 + 4.0 * a * f.k3 + 6.0 * a * a * f.var + a * a * a * a) +
+               p * (g4 + 4.0 * b * g.k3 + 6.0 * b * b * g.var + b * b * b * b) - 3.0 * r.var * r.var;
+    }
     return r;
 }
+// the weights of two explanations come from their evidence
+constexpr int weighed(int depth) { return depth == moments ? int(evidence) : depth; }
 
 // f = (1 - eps) (uniform on [-s, s] plus N(0, R)) + eps N(0, (wide s)^2 + R): outliers
-inline Tilted4 contaminated4(V4 mu, V4 c, V4 s, V4 R, V4 eps, V4 wide) {
-    const V4 W = wide * wide * s * s, all = W + R;
-    Tilted4 g = gaussian4(mu, c, all);
-    const V4 slope = g.slope_R / max4(all, all4(1e-300));
+template <int depth, class X>
+inline Tilted<X> contaminated4(const Cavity<X>& q, X s, X R, X eps, X wide) {
+    const X W = wide * wide * s * s, both = W + R;
+    Tilted<X> g = gaussian4<weighed(depth)>(q, both);
+    const X slope = g.slope_R / max4(both, all<X>(1e-300));
     g.slope_s = 2.0 * slope * W;
     g.slope_R = slope * R;
-    return mixture4(uniform_gaussian4(mu, c, s, R), g, eps);
+    return mixture4<depth>(uniform_gaussian4<weighed(depth)>(q, s, R), g, eps);
 }
 
 // f = (1 - eps) (uniform on [-s, s] plus N(0, R)) + eps exp(log_lost): a row that may say nothing of z
-inline Tilted4 maybe_lost4(V4 mu, V4 c, V4 s, V4 R, V4 eps, V4 log_lost) {
-    Tilted4 g{};
+template <int depth, class X>
+inline Tilted<X> maybe_lost4(const Cavity<X>& q, X s, X R, X eps, X log_lost) {
+    Tilted<X> g{};
     g.log_z = log_lost;
-    g.mean = mu;
-    g.var = c;
-    return mixture4(uniform_gaussian4(mu, c, s, R), g, eps);
+    g.mean = q.mu;
+    g.var = q.c;
+    return mixture4<depth>(uniform_gaussian4<weighed(depth)>(q, s, R), g, eps);
 }
 
 }  // namespace HW_ISA

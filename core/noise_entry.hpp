@@ -3,7 +3,7 @@
 
 #include <cstddef>
 
-#include "isa.hpp"
+#include "wide.hpp"
 
 namespace hw {
 
@@ -32,5 +32,5 @@ struct TiltedArgs {
 
 }  // namespace hw
 
-HW_KERNEL(void, noise_truncated, const hw::TruncatedArgs& args)
-HW_KERNEL(void, noise_tilted, const hw::TiltedArgs& args)
+HW_WIDE_KERNEL(void, noise_truncated, const hw::TruncatedArgs& args)
+HW_WIDE_KERNEL(void, noise_tilted, const hw::TiltedArgs& args)

@@ -153,3 +153,35 @@ def test_nonsense_ends(avx2):
         np.testing.assert_allclose(found["x"][0], run(chain, s)["x"][0], atol=1e-6)
     finally:
         _core.use_isa(True)
+
+
+@pytest.mark.parametrize("name", ["bounds", "correlated", "many states"])
+def test_eight_lanes_equal_four(name):
+    wide = _core.wide()
+    if not _core.use_wide(True):
+        pytest.skip("no AVX-512 here")
+    try:
+        model, record, s = system(7, **CASES[name])
+        chain = sites(model, record)
+        members = s * np.random.default_rng(1).uniform(0.9, 1.4, (11, s.size))
+        eight = run(chain, members)
+        _core.use_wide(False)
+        four = run(chain, members)
+        for key in ("x", "P", "k3", "k4", "log_z", "slope"):
+            np.testing.assert_allclose(eight[key], four[key], atol=1e-9)
+    finally:
+        _core.use_wide(wide)
+
+
+def test_shapes_of_a_tilted_box_are_cumulants():
+    """Deep in a tail, about the middle, nearly uniform: against a fine sum."""
+    for mu, c, half in [(0.3, 1.0, 1.0), (4.0, 1.0, 1.0), (-30.0, 1.0, 1.0), (0.1, 100.0, 0.5), (0.9, 0.04, 1.0)]:
+        model = hw.Linear([[0.0]], None, [[1.0]], hw.Uniform(half), hw.Gaussian(c), hw.Normal([0.0], 1.0))
+        found = run(sites(model, hw.Record([0.0], [mu])), [half, 0.0])
+        z = np.linspace(-half, half, 400_001)
+        p = np.exp(-0.5 * (z - mu) ** 2 / c + 0.5 * min(0.0, half - abs(mu)) ** 2 / c)
+        p /= p.sum()
+        mean = p @ z
+        var = p @ (z - mean) ** 2
+        assert found["k3"][0, 1, 0] == pytest.approx(p @ (z - mean) ** 3 / var**1.5, abs=2e-3)
+        assert found["k4"][0, 1, 0] == pytest.approx(p @ (z - mean) ** 4 / var**2 - 3, abs=5e-3)

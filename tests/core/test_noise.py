@@ -30,27 +30,33 @@ def boxes(rng, kind):
     return (mu, c, lo, math.inf) if kind == "above lo" else (mu, c, -math.inf, lo)
 
 
-@pytest.mark.parametrize("avx2", [True, False])
+@pytest.fixture(params=["base", "avx2", "avx512"])
+def isa(request):
+    """Each instruction set that this machine has, in turn."""
+    wide = _core.wide()
+    if not _core.use_isa(request.param != "base") or not _core.use_wide(request.param == "avx512"):
+        pytest.skip(f"no {request.param} here")
+    yield request.param
+    _core.use_isa(True)
+    _core.use_wide(wide)
+
+
+@pytest.mark.usefixtures("isa")
 @pytest.mark.parametrize("kind", ["any", "narrow", "tail", "below", "above lo", "below hi"])
-def test_a_box_equals_quadrature(kind, avx2):
+def test_a_box_equals_quadrature(kind):
     rng = np.random.default_rng(3)
-    try:
-        if not _core.use_isa(avx2):
-            pytest.skip("no AVX2 here")
-        for _ in range(150):
-            mu, c, lo, hi = boxes(rng, kind)
-            got, want = truncated(mu, c, lo, hi), naive.truncated(mu, c, lo, hi)
-            sd = math.sqrt(want[2])
-            assert got[0] == pytest.approx(want[0], rel=1e-13, abs=1e-13)
-            assert abs(got[1] - want[1]) < 1e-10 * sd + 4e-16 * abs(want[1])
-            assert got[2] == pytest.approx(want[2], rel=1e-10)
-            density = want[3] + want[4]
-            if 1e-300 < density < math.inf:
-                assert abs(got[3] - want[3]) + abs(got[4] - want[4]) < 1e-12 * density
-            if math.isfinite(hi - lo):
-                assert got[5] == pytest.approx(want[5], rel=1e-12, abs=1e-12)
-    finally:
-        _core.use_isa(True)
+    for _ in range(150):
+        mu, c, lo, hi = boxes(rng, kind)
+        got, want = truncated(mu, c, lo, hi), naive.truncated(mu, c, lo, hi)
+        sd = math.sqrt(want[2])
+        assert got[0] == pytest.approx(want[0], rel=1e-13, abs=1e-13)
+        assert abs(got[1] - want[1]) < 1e-10 * sd + 4e-16 * abs(want[1])
+        assert got[2] == pytest.approx(want[2], rel=1e-10)
+        density = want[3] + want[4]
+        if 1e-300 < density < math.inf:
+            assert abs(got[3] - want[3]) + abs(got[4] - want[4]) < 1e-12 * density
+        if math.isfinite(hi - lo):
+            assert got[5] == pytest.approx(want[5], rel=1e-12, abs=1e-12)
 
 
 def test_lanes_do_not_meet():

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.methods._sites import Sites
+from halfwidth.methods._sites import CONTAMINATED, Sites
 from halfwidth.spread import Normal
 
 if TYPE_CHECKING:
@@ -177,6 +177,40 @@ def messages(chain: Sites, sites: tuple[Array, ...], stages: int) -> list[tuple[
     return found
 
 
+class Warm(NamedTuple):
+    """Sites of a solved window: half-widths (p,), first row of each stage (T + 2,), (m, D, tau, nu) of `Sites`."""
+
+    s: Array
+    start: Array
+    sites: tuple[Array, ...]
+
+    def moved(self, chain: Sites, a: int) -> tuple[Array, Array, Array, Array] | None:
+        """Return sites of the chain that begins `a` rows later: its new ones are the Gaussians of their variances.
+
+        None where the two do not hold the same rows in common.
+        """
+        p = chain.problem
+        n, start = len(p["m0"]), p["start"]
+        m_, D_ = (v.reshape(-1, n) for v in self.sites[:2])
+        tau_, nu_ = (np.ravel(v) for v in self.sites[2:])
+        common, stages = len(m_) - 1 - a, len(start) - 1
+        if common < 1 or common + 1 > stages:
+            return None
+        here, there = slice(start[1], start[common + 1]), slice(self.start[a + 1], self.start[-1])
+        if here.stop - here.start != there.stop - there.start:
+            return None
+        m, D = np.zeros((1, stages, n)), np.empty((1, stages, n))
+        D[0, 0] = p["half0"] ** 2 / 3.0
+        D[0, 1:] = np.where(p["group_w"] >= 0, self.s[p["group_w"]] ** 2 / 3.0, 0.0)
+        m[0, 1 : common + 1], D[0, 1 : common + 1] = m_[1 + a :], D_[1 + a :]
+        kind, R = p["kind"], p["R"]
+        box = np.where(p["group"] >= 0, self.s[p["group"]], 0.0)
+        tau = np.where(kind < CONTAMINATED, 1.0 / np.maximum(box**2 / 3.0 + R, 1e-300), 0.0)[None]
+        nu = np.zeros((1, len(kind)))
+        tau[0, here], nu[0, here] = tau_[there], nu_[there]
+        return m, D, tau, nu
+
+
 class Carried:
     """What the windows of a stream hand on.
 
@@ -191,6 +225,8 @@ class Carried:
     ----------
     s : (p,) array or None
         Half-widths at the mode of the newest window.
+    warm : Warm or None
+        Its sites.
     """
 
     def __init__(self, p: int, rows: float) -> None:
@@ -199,6 +235,7 @@ class Carried:
         self.waiting: list[tuple[int, Known]] = []  # newest row of a window, and what it told, weighted
         self.s: Array | None = None
         self.count = 0  # windows that told something
+        self.warm: Warm | None = None
         self.first: Normal | None = None  # the state before the first row, once rows have left
         self._edge: list[tuple[Array, Array]] | None = None  # messages of the newest window's stages ...
         self._newest: Answer | None = None  # ... or what they are made of
@@ -223,14 +260,15 @@ class Carried:
         d = np.diagonal(P)
         if not (np.isfinite(x).all() and np.isfinite(P).all() and (d > 0).all()):
             return None
-        return Normal(x, P + np.diag(1e-12 * d))
+        return Normal.of(x, P + np.diag(1e-12 * d))
 
     def take(self, answer: "Answer", newest: int, rows: int, *, counts: bool) -> None:
         """Keep what a window told: its newest row's number, its number of rows, and whether it told anything new."""
-        self._edge, self._newest = None, None
+        self._edge, self._newest, self.warm = None, None, None
         if not answer.estimate.status.good:
             return
         self.s, self._newest = answer.start.s, answer
+        self.warm = Warm(self.s, answer.chain.problem["start"], answer.found["sites"])
         if not counts:
             return
         known = Known.none(len(self.s)).plus(told(answer), 1.0 / rows)
@@ -250,6 +288,9 @@ class Carried:
             "waiting": [[k, known.pull.tolist(), known.precision.tolist()] for k, known in self.waiting],
             "count": self.count,
             "s": None if self.s is None else self.s.tolist(),
+            "warm": None
+            if self.warm is None
+            else [self.warm.start.tolist(), [np.ravel(v).tolist() for v in self.warm.sites]],
             "first": None if self.first is None else [self.first.mean.tolist(), self.first.P.tolist()],
             "edge": None if edge is None else [[x.tolist(), P.tolist()] for x, P in edge],
         }
@@ -262,6 +303,10 @@ class Carried:
         ]
         self.count = int(saved["count"])
         self.s = None if saved["s"] is None else np.array(saved["s"], dtype=float)
+        self.warm = None
+        if saved["warm"] is not None and self.s is not None:
+            start, sites = saved["warm"]
+            self.warm = Warm(self.s, np.array(start, dtype=int), tuple(np.array(v, dtype=float) for v in sites))
         first, edge = saved["first"], saved["edge"]
         self.first = None if first is None else Normal(*first)
         self._newest = None

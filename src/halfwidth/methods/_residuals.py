@@ -19,6 +19,7 @@ Pavelková (2011), ÚTIA report 2296, eqs. (7), (8), (14), (18); Pavelková and 
 Redundancy and variance components: Förstner (1979), Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -256,18 +257,29 @@ def first_scales(model: Linear, seen: Sequence[Array]) -> Array:
         one = matrix.value if matrix.value is not None else matrix.at(0.0, model.dt)
         return one if one.ndim == 2 else one.mean(axis=0)
 
-    inverse = np.linalg.inv(typical(model.E, nx))
-    Phi = inverse @ typical(model.A, nx)
-    H = typical(model.C, nx) / sigma[nx:, None] * np.array([[len(y) > 0] for y in seen])
+    C = np.ascontiguousarray(typical(model.C, nx), dtype=float)
+    felt = _felt(
+        nx, *(np.ascontiguousarray(typical(v, nx), dtype=float).tobytes() for v in (model.E, model.A)), C.tobytes()
+    )
+    weight = np.array([1.0 / s**2 if len(y) else 0.0 for s, y in zip(sigma[nx:], seen, strict=True)])
+    gram = weight @ felt
+    sigma[:nx][gram > 0] = 1.0 / np.sqrt(gram[gram > 0])
+    return sigma
+
+
+@functools.lru_cache(maxsize=256)
+def _felt(nx: int, E: bytes, A: bytes, C: bytes) -> Array:
+    """Return what a unit disturbance of each state does to each output: sums of squares over later rows, (ny, nx)."""
+    inverse = np.linalg.inv(np.frombuffer(E).reshape(nx, nx))
+    Phi = inverse @ np.frombuffer(A).reshape(nx, nx)
+    H = np.frombuffer(C).reshape(-1, nx)
     # A model that grows is discounted by its growth: what a disturbance does after many rows says nothing of its size.
     growth = max(1.0, float(np.abs(np.linalg.eigvals(Phi)).max(initial=0.0)))
-    gram, step, keep = np.zeros((nx, nx)), inverse, 1.0
+    found, step, keep = np.zeros(H.shape), inverse, 1.0
     for _ in range(50):
-        gram += keep * (H @ step).T @ (H @ step)
+        found += keep * (H @ step) ** 2
         step, keep = Phi @ step / growth, 0.9 * keep
-    felt = gram.diagonal() > 0
-    sigma[:nx][felt] = 1.0 / np.sqrt(gram.diagonal()[felt])
-    return sigma
+    return found
 
 
 def _least_squares(rows: Residuals, sigma: Array) -> tuple[Any, Array]:

@@ -107,9 +107,8 @@ def sites(model: Linear, record: Record, *, outliers: bool = False) -> Sites:
         ("hi", float),
     ):
         problem[name] = joined(name, dtype)
-    lost, mix = joined("lost", float), joined("mix", float, (p,))
-    problem["lost"] = lost if (problem["kind"] == MAYBE_LOST).any() else None
-    problem["mix"] = mix if mix.any() else None
+    problem["lost"] = joined("lost", float) if (problem["kind"] == MAYBE_LOST).any() else None
+    problem["mix"] = joined("mix", float, (p,)) if any(r.mix.any() for r in rows) else None
     output = joined("output", np.intp)
     count = np.r_[np.full(nx, float(T)), [float(np.count_nonzero(output == j)) for j in range(ny)]]
     free = uniform & (floor < cap) & (count > 0)
@@ -328,11 +327,11 @@ def _bounds(model: Linear, T: int) -> list[_Rows]:
     p = model.nx + model.ny
     keep = np.isfinite(lo) | np.isfinite(hi)
     D, lo, hi = D[keep], lo[keep], hi[keep]
-    found = []
-    for d, a, b in zip(D, lo, hi, strict=True):
-        stage, h = np.arange(1, T + 1), np.broadcast_to(d, (T, model.nx))
-        found.append(_Rows.of(p, stage, h, TRUNCATION, lo=np.full(T, a), hi=np.full(T, b)))
-    return found
+    if not keep.any():
+        return []
+    K = len(D)
+    stage, h = np.repeat(np.arange(1, T + 1), K), np.broadcast_to(D, (T, K, model.nx)).reshape(-1, model.nx)
+    return [_Rows.of(p, stage, h, TRUNCATION, lo=np.tile(lo, T), hi=np.tile(hi, T))]
 
 
 def _first_bounds(model: Linear) -> list[_Rows]:

@@ -13,6 +13,7 @@ References
 Pavelková and Kárný (2013), secs. 2, 5.1, 5.2.
 """
 
+import copy
 import json
 import math
 from dataclasses import replace
@@ -162,8 +163,7 @@ class Sliding:
         fresh = self.since == 0 or self.last is None or not isinstance(method, BatchLP | SequentialLP)
         if fresh:
             solved = self._solve(local, part, a)
-            for k in range(len(part) + 1):
-                self._note(a + k, solved.x[k], last)
+            self._note_all(a, solved.x, last)
             if self.since == 0 and knows and solved.status.good:
                 self.ahead.take(solved.x[-1], np.nan_to_num(solved.s[: model.nx]), window.memory)
         else:
@@ -177,6 +177,15 @@ class Sliding:
     def back(self) -> int:
         """Return how many rows ago the state is that is asked for: `lag`, or that of the first row."""
         return min(self.window.lag, self.pushed - 1)
+
+    def _note_all(self, a: int, x: Array, last: NDArray[np.int32]) -> None:
+        """Note the estimates x of the states from a on; the newest one has none so far."""
+        held = len(self.low) - a
+        open_ = (len(self.times) - 1 <= last[a : a + held])[:, None]
+        low, high = np.array(self.low[a:]), np.array(self.high[a:])
+        self.low[a:] = [*np.where(open_, np.minimum(low, x[:held]), low), *x[held:].copy()]
+        self.high[a:] = [*np.where(open_, np.maximum(high, x[:held]), high), *x[held:].copy()]
+        self.x[a:] = list(x)
 
     def _note(self, k: int, x: Array, last: NDArray[np.int32]) -> None:
         self.x[k] = x
@@ -212,6 +221,11 @@ class Sliding:
             box = model.bounds if isinstance(model.bounds, Box) else free
             held = interval(self.low[a], self.high[a], self.window.memory, self.window.carry) if finished else None
             changes["x0"] = box if held is None else meet(box, held)
+        if changes.keys() <= {"dt", "x0"}:  # both judged already
+            local = copy.copy(model)
+            for name, value in changes.items():
+                object.__setattr__(local, name, value)
+            return local
         return replace(model, **changes)
 
     def _solve(self, model: Model, part: Record, a: int) -> Solved:
@@ -242,8 +256,9 @@ class Sliding:
         held, method = self.carried, self.window.method
         assert held is not None
         assert isinstance(method, Posterior)
-        seen = np.atleast_1d(part.seen.any(axis=1))
-        answer = method.resumed(model, part, held.s, held.known(self.first + a))
+        seen = np.asarray(part.seen.any(axis=1))
+        warm = None if held.warm is None else (held.warm, a)
+        answer = method.resumed(model, part, held.s, held.known(self.first + a), warm)
         newest = self.first + len(self.times) - 1
         rows = max(int(seen.sum()), self.window.memory + 1)
         held.take(answer, newest, rows, counts=bool(seen[-1]))
@@ -455,6 +470,8 @@ def window_starts(
     """
     T, ny = seen.shape
     rows = np.arange(T)
+    if seen.all():
+        return np.maximum(rows - memory, 0).astype(np.int32)
     places = np.flatnonzero(seen.any(axis=1))
     before = np.searchsorted(places, rows, side="right")  # rows with a seen output up to and with each row
     start = np.where(before > memory, np.r_[places, 0][np.maximum(before - memory - 1, 0)], 0)
@@ -483,6 +500,11 @@ def window_lasts(
     """
     T, ny = seen.shape
     rows = np.arange(T)
+    if seen.all():
+        last = np.arange(memory - 1, T + memory, dtype=np.int32)
+        if used is not None and edge is not None:
+            last[0] += bool((used & ~edge).any())
+        return last
     end, first = rows.copy(), -1
     for j in range(ny):
         later = np.minimum.accumulate(np.where(seen[:, j], rows, T - 1)[::-1])[::-1]

@@ -33,7 +33,7 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
-from halfwidth.methods._carry import WARP, Known
+from halfwidth.methods._carry import WARP, Known, Warm
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Sites, gaussian_part, sites, uniform_part
 from halfwidth.model import Linear, Model, Nonlinear
@@ -46,7 +46,7 @@ _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
 POWER = 0.85
 _LIMITS = {
-    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.25, "least": 0.3,
+    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "least": 0.3,
     "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
 }  # fmt: skip
 #: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone
@@ -57,10 +57,12 @@ _EVENT = 26
 _LONG = 2000
 _FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
+#: The mode of the window before is a good centre of nodes up to this distance, in standard deviations.
+_NEAR = 0.8
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
-_MIXED = {"most": 12, "damping": 0.5}
+_MIXED = {"most": 20, "damping": 0.5}
 #: Moments that agree this well, in standard deviations, are good, and good enough to be used.
 _FINE, _USABLE = 0.01, 0.1
 #: Fewer effective nodes than this leave an integral over half-widths rough.
@@ -213,25 +215,39 @@ class Posterior:
             return with_entries(self, model, record)
         return self.answer(model, record).estimate
 
-    def resumed(self, model: Model, record: Record, s: Array | None, known: Known | None) -> "Answer":
-        """Return the answer of one window of a stream; `s` is where to start, `known` what earlier rows told."""
+    def resumed(
+        self, model: Model, record: Record, s: Array | None, known: Known | None, warm: tuple[Warm, int] | None = None
+    ) -> "Answer":
+        """Return the answer of one window of a stream.
+
+        `s` is where to start, `known` what earlier rows told, `warm` the sites of the window before and how many rows
+        later this one begins.
+        """
         if isinstance(model, Nonlinear):
             from halfwidth.methods._relinearise import relinearised
 
             return relinearised(self, model, record, s=s, known=known)
-        return self.answer(model, record, start=s, known=known)
+        return self.answer(model, record, start=s, known=known, warm=warm)
 
     def answer(
-        self, model: Linear, record: Record, *, start: "Start | Array | None" = None, known: Known | None = None
+        self,
+        model: Linear,
+        record: Record,
+        *,
+        start: "Start | Array | None" = None,
+        known: Known | None = None,
+        warm: tuple[Warm, int] | None = None,
     ) -> "Answer":
         """Return the estimate of a model without unknown entries, and what the next one may start from.
 
         `start` holds half-widths (p,), with the sites that belong to them if the chain has the same shape; `known` is
-        what other rows told of half-widths.
+        what other rows told of half-widths; `warm` as in `resumed`.
         """
         if isinstance(start, np.ndarray):
             start = Start(start, None)
         problem = sites(model, record, outliers=self.outliers is not False and self.outliers != 0)
+        if warm is not None and problem.free.any():
+            start = Start(warm[0].s, warm[0].moved(problem, warm[1]))
         if start is None and len(record) > 2 * _FIRST and problem.free.any():
             # The first rows alone say where to look.
             cut = {k: v.value[:_FIRST] for k, v in model.matrices.items() if v.value is not None and v.value.ndim == 3}
@@ -268,6 +284,8 @@ class Posterior:
             limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
             limits |= _MIXED
+        if sites_ is not None:
+            limits["close"] = _NEAR
         if chain.exact:
             limits["most"] = 1
         return dict(
