@@ -85,7 +85,7 @@ def verdict(track: Track) -> str:
     """Say in one or two sentences what was filled and how well the worst of it is known."""
     if not track.gaps:
         return (
-            "No gaps to fill: every row has a fix, and each is known to within"
+            "No gaps to fill: every row has a fix, and each is where the receiver saw it to within"
             f" {_size(float(track.half_m.max()))} east and north."
         )
     count = len(track.gaps)
