@@ -39,7 +39,8 @@ class Tunnel:
     half_m : float
         Largest stated half-width, in metres.
     inside : float
-        Share of the rows whose true position lies within the half-widths, east and north both.
+        Share of the rows whose true position lies within the half-widths about the truth (`Track.truth_half_m`, where
+        the fixes' slow error is known), east and north both.
     line_error_m : float
         Largest distance between the straight line across the tunnel and the truth, in metres.
     """
@@ -117,7 +118,7 @@ class Demo:
                 *lines,
                 "",
                 f"stated: the largest half-width at level {track.level:g}, east or north, of where the receiver would",
-                "have seen the vehicle. inside: true positions within both, although nobody sees its slow error.",
+                "have seen the vehicle. inside: true positions within `truth_half_m`, which adds its slow error.",
                 "",
                 f"log     {self.log}",
                 f"track   {self.output}",
@@ -235,7 +236,10 @@ def _tunnel(truth: Truth, track: Track, first: float, last: float) -> Tunnel:
     inside = (track.t_s >= first) & (track.t_s <= last)
     t = track.t_s[inside]
     east, north = truth.error_m(t, track.lat_deg[inside], track.lon_deg[inside])
-    held = (np.abs(east) <= track.east_half_m[inside]) & (np.abs(north) <= track.north_half_m[inside])
+    half = track.truth_half_m
+    if half is None:
+        half = np.column_stack((track.east_half_m, track.north_half_m))
+    held = (np.abs(np.column_stack((east, north))) <= half[inside]).all(axis=1)
     # the straight line between the rows at both ends
     ends = np.flatnonzero(inside)[[0, -1]] + np.array([-1, 1])
     ends = np.clip(ends, 0, len(track) - 1)
