@@ -3,8 +3,7 @@
 Hiding fixes shows where the receiver would have seen the vehicle, not where the vehicle was. But a receiver whose error
 wanders does not agree with dead reckoning, and that is in the log: the chain with Gaussian increments of the fix offset
 (`chain`, no drift) has a likelihood, and here it is made largest over the scale of these increments alone. Expectation
-maximisation moves this scale so slowly that it stays near where it began (measured: 0.8 to 1.3 m for true errors of
-0.04 to 0.5 m, where the largest likelihood finds 0.08 to 0.5 m).
+maximisation moves this scale so slowly that it stays near where it began.
 
 How long an error lasts is not in the log: a receiver that is off by the same all along agrees with itself. `MEMORY` is
 an assumption, twice the chain's 60 s to be rather too wide than too narrow; an error that lasts longer is only found in
