@@ -76,6 +76,18 @@ class Problem {
         a.half0 = half0.data();
         a.group_w = group_w.data();
         for (std::size_t i = 0; i < n; i++) want(a.group_w[i] < a.groups, "group_w out of range");
+        if (has("group_Q")) {
+            const InInt of = typed<InInt>("group_Q");
+            want(of.size() == n, "group_Q (n,)");
+            a.group_Q = of.data();
+            for (std::size_t i = 0; i < n; i++) want(a.group_Q[i] < a.groups, "group_Q out of range");
+        }
+        if (has("group_R")) {
+            const InInt of = typed<InInt>("group_R");
+            want(of.size() == rows, "group_R (rows,)");
+            a.group_R = of.data();
+            for (std::size_t k = 0; k < rows; k++) want(a.group_R[k] < a.groups, "group_R out of range");
+        }
         a.start = start.data();
         want(a.start[0] == 0 && a.start[T + 1] == static_cast<int>(rows), "start runs from 0 to the number of rows");
         for (std::size_t t = 0; t <= T; t++) want(a.start[t] <= a.start[t + 1], "start must not fall");
@@ -107,7 +119,7 @@ class Problem {
             want(what != hw::noise_maybe_lost || a.lost, "lost is missing");
             want(a.group[k] >= 0 || what == hw::noise_gaussian || what == hw::noise_maybe_lost || what == hw::ep_truncation,
                  "a row needs a half-width");
-            want(what != hw::noise_gaussian || a.R[k] > 0, "a Gaussian row needs a variance");
+            want(what != hw::noise_gaussian || a.R[k] > 0 || (a.group_R && a.group_R[k] >= 0), "a Gaussian row needs a variance");
         }
         a.wide = nb::cast<double>(given["wide"]);
     }

@@ -45,7 +45,7 @@ def test_messages_with_matrices_that_vary_and_correlate():
         hw.Normal(np.zeros(3), 1.0), E=E,
     )  # fmt: skip
     answer = hw.Posterior().answer(model, record)
-    found = messages(answer.chain, answer.found["sites"], 12)
+    found = messages(answer.chain, answer.start.s, answer.found["sites"], 12)
     kf = hw.estimate(model, record, hw.KalmanFilter())
     np.testing.assert_allclose([x for x, _ in found[1:]], kf.x, atol=1e-9)
     np.testing.assert_allclose([P for _, P in found[1:]], kf.P, atol=1e-9)

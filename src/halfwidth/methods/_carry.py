@@ -143,9 +143,10 @@ def inside(chain: Sites, s: Array) -> Known:
     return known
 
 
-def messages(chain: Sites, sites: tuple[Array, ...], stages: int) -> list[tuple[Array, Array]]:
+def messages(chain: Sites, s: Array, sites: tuple[Array, ...], stages: int) -> list[tuple[Array, Array]]:
     """Return mean and covariance of x_0 .. x_stages, each given what lies up to it, by the sites of a solved chain."""
     p = chain.problem
+    V = chain.variances(s)[0]
     n = len(p["m0"])
     m, D = (np.asarray(v).reshape(-1, n) for v in sites[:2])
     tau, nu = (np.ravel(v) for v in sites[2:])
@@ -163,7 +164,7 @@ def messages(chain: Sites, sites: tuple[Array, ...], stages: int) -> list[tuple[
         if t:
             A, G, Q = at("A", t - 1), at("G", t - 1), at("Q", t - 1)
             x = A @ x + p["b"][t - 1] + (m[t] if G is None else G @ m[t])
-            P = A @ P @ A.T + (np.diag(D[t]) if G is None else (G * D[t]) @ G.T)
+            P = A @ P @ A.T + (np.diag(D[t] + V) if G is None else (G * (D[t] + V)) @ G.T)
             if Q is not None:
                 P = P + Q
         for k in range(int(p["start"][t]), int(p["start"][t + 1])):
@@ -205,6 +206,7 @@ class Warm(NamedTuple):
         m[0, 1 : common + 1], D[0, 1 : common + 1] = m_[1 + a :], D_[1 + a :]
         kind, R = p["kind"], p["R"]
         box = np.where(p["group"] >= 0, self.s[p["group"]], 0.0)
+        R = R + chain.variances(self.s)[1]
         tau = np.where(kind < CONTAMINATED, 1.0 / np.maximum(box**2 / 3.0 + R, 1e-300), 0.0)[None]
         nu = np.zeros((1, len(kind)))
         tau[0, here], nu[0, here] = tau_[there], nu_[there]
@@ -217,7 +219,7 @@ class Carried:
     Parameters
     ----------
     p : int
-        Number of half-widths (q, r).
+        Number of groups, as in `Sites`.
     rows : float
         Rows over which what is known of half-widths fades to 1 / e.
 
@@ -253,7 +255,7 @@ class Carried:
 
     def _state(self, a: int) -> Normal | None:
         if self._edge is None and self._newest is not None:
-            self._edge = messages(self._newest.chain, self._newest.found["sites"], a)
+            self._edge = messages(self._newest.chain, self._newest.start.s, self._newest.found["sites"], a)
         if self._edge is None or len(self._edge) <= a:
             return None
         x, P = self._edge[a]
@@ -282,7 +284,7 @@ class Carried:
         edge = self._edge
         if self._newest is not None:
             stages = len(self._newest.chain.problem["start"]) - 2
-            edge = messages(self._newest.chain, self._newest.found["sites"], stages)
+            edge = messages(self._newest.chain, self._newest.start.s, self._newest.found["sites"], stages)
         return {
             "gone": [v.tolist() for v in self.gone],
             "waiting": [[k, known.pull.tolist(), known.precision.tolist()] for k, known in self.waiting],

@@ -100,10 +100,11 @@ class Posterior:
     half-widths and entries, and ``ess``, their smallest effective number of draws; the status is REDUCED above an R-hat
     of 1.01 and STALLED above 1.05. Of "ep":
 
-    ``q``, ``r`` are posterior means. ``loglik`` is the logarithm of the evidence, half-widths integrated out under a
+    ``q``, ``r`` are posterior means, ``Q``, ``R`` those of unknown variances. ``loglik`` is the logarithm of the evidence, half-widths integrated out under a
     prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
     count as a factor in 26 rows and as a condition in the others. In ``info``: ``x0``; ``half_widths``, a mapping
-    with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %) of (q, r); ``outliers``, the named outputs with a
+    with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %) of (q, r); ``variances``, the same of (Q, R) where some are
+    unknown; ``outliers``, the named outputs with a
     probability above one half; ``residual``,
     the disagreement of moments in standard deviations, the largest of each node; ``sweeps``; ``nodes`` and their
     ``effective`` number.
@@ -258,15 +259,14 @@ class Posterior:
             except BadShape:  # a noise stacked row by row
                 quick = None
             if quick is not None and int(quick.found["code"]) < 2:
-                start = Start(np.where(quick.chain.free, quick.start.s, math.sqrt(3.0) * problem.scale), None)
+                start = Start(np.where(quick.chain.free, quick.start.s, problem.guess), None)
         known = None if known is None else known.of(problem.free)
         found = self._solve(problem, model, start, known)
         return Answer(self._estimate(problem, found, model, record), problem, found, known)
 
     def _solve(self, chain: Sites, model: Linear, start: "Start | None", known: Known | None) -> dict[str, Any]:
         rate, learn_rate, beta = self._rate(model)
-        first = np.where(chain.uniform, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), 0.0)
-        first = np.where(chain.free, first, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
+        first = np.where(chain.free, chain.guess, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
         sites_, was = None, None
         if start is not None:
             first = np.where(chain.free, np.clip(start.s, chain.floor, chain.cap), first)
@@ -340,7 +340,7 @@ class Posterior:
         within = None if box is None else (np.asarray(box.lo), np.asarray(box.hi))
         if box is not None:
             x = np.concatenate([x[:1], np.clip(x[1:], box.lo, box.hi)])
-        if chain.exact or not sound:
+        if (chain.exact and not chain.free.any()) or not sound:
             spread: Any = Normal.of(x[1:].copy(), P[1:].copy(), within)
         else:
             spread = Shaped(x[1:].copy(), P[1:].copy(), k3[1:].copy(), k4[1:].copy(), within)
@@ -356,16 +356,19 @@ class Posterior:
             else:
                 info["outliers"] = _named(share, model, record)
                 info["outlier_probability"] = share
-        has_q, has_r = chain.uniform[:nx].any(), chain.uniform[nx:].any()
-        lost = chain.uniform & (chain.floor < chain.cap) & (chain.count == 0)
-        if lost.any():
-            names = [*model.names.x, *model.names.y]
-            info["notes"].append(
-                "bound not identifiable: " + ", ".join(n for n, m in zip(names, lost, strict=True) if m)
-            )
+        names = [*model.names.x, *model.names.y]
+        p = len(names)
+        has_q, has_r = chain.uniform[:nx].any(), chain.uniform[nx:p].any()
+        has_Q, has_R = chain.fitted[p : p + nx].any(), chain.fitted[p + nx :].any()
+        lost = (chain.uniform | chain.fitted) & (chain.floor < chain.cap) & (chain.count == 0)
+        for what, part in (("bound", lost[:p]), ("variance", lost[p:])):
+            if part.any():
+                info["notes"].append(f"{what} not identifiable: " + ", ".join(np.array(names)[part]))
+        if has_Q or has_R:
+            info["variances"] = widths.part(slice(p, None))
         info |= {
             "x0": x[0].copy(),
-            "half_widths": {"mean": widths.mean, "sd": widths.sd, "lo": widths.lo, "hi": widths.hi},
+            "half_widths": widths.part(slice(p)),
             "rate": widths.rate,
             "residual": residual,
             "sweeps": int(found["sweeps"]),
@@ -379,7 +382,9 @@ class Posterior:
             status,
             typed(self),
             q=widths.mean[:nx].copy() if has_q and sound else None,
-            r=widths.mean[nx:].copy() if has_r and sound else None,
+            r=widths.mean[nx:p].copy() if has_r and sound else None,
+            Q=widths.mean[p : p + nx].copy() if has_Q and sound else None,
+            R=widths.mean[p + nx :].copy() if has_R and sound else None,
             gamma=gamma,
             loglik=loglik,
             names=model.names.x,
@@ -390,7 +395,8 @@ class Posterior:
     def _fallback(self, chain: Sites, widths: "_Widths") -> tuple[Array, Array]:
         """Return the moments of the chain with every uniform replaced by a Gaussian of its variance."""
         problem = dict(chain.problem, half0=np.maximum(chain.problem["half0"], 0.0))
-        s = np.ascontiguousarray(np.where(widths.mean > 0, widths.mean, 1e-9 * np.maximum(chain.scale, 1e-290))[None])
+        s = np.where(chain.fitted, np.sqrt(widths.mean), widths.mean)
+        s = np.ascontiguousarray(np.where(s > 0, s, 1e-9 * np.maximum(chain.scale, 1e-290))[None])
         found = _core.ep_run(problem, s, np.zeros(1), 0, 1.0, 1.0, None)
         x, P = found["x"][0], found["P"][0]
         bad = ~(np.isfinite(x).all(axis=1) & np.isfinite(P).all(axis=(1, 2)))
@@ -425,7 +431,7 @@ class Answer(NamedTuple):
 
 
 class _Widths(NamedTuple):
-    """Posterior of the half-widths (q, r), each (p,), and of the rate."""
+    """Posterior of the half-widths (q, r) and of unknown variances (Q, R), each (p,), and of the rate."""
 
     mean: Array
     sd: Array
@@ -434,15 +440,20 @@ class _Widths(NamedTuple):
     rate: float | None
     effective: float
 
+    def part(self, which: slice) -> dict[str, Array]:
+        """Return the moments and quantiles of some of them by name."""
+        return {name: getattr(self, name)[which] for name in ("mean", "sd", "lo", "hi")}
+
     @classmethod
     def none(cls, chain: Sites) -> "_Widths":
         """Known half-widths as they are, free ones generously from the data's scale."""
-        s = np.where(chain.free, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), chain.floor)
+        s = np.where(chain.free, chain.guess, chain.floor)
+        s = np.where(chain.fitted, s**2, s)
         return cls(s, np.zeros_like(s), s, s, None, 0.0)
 
     @classmethod
     def of(cls, chain: Sites, found: dict[str, Any]) -> "_Widths":
-        mean = chain.floor.copy()
+        mean = np.where(chain.fitted, chain.floor**2, chain.floor)
         sd, lo, hi = np.zeros_like(mean), mean.copy(), mean.copy()
         free = np.flatnonzero(chain.free)
         K = int(found["nodes"])
@@ -451,12 +462,13 @@ class _Widths(NamedTuple):
         if K > 1:
             weight = np.exp(found["log_weight"][:K] - found["log_weight"][:K].max())
             weight /= weight.sum()
-        s = np.exp(phi[:, : free.size])
+        power = np.where(chain.fitted[free], 2.0, 1.0)  # a variance is the square of its group
+        s = np.exp(power * phi[:, : free.size])
         m = weight @ s
         mean[free] = m
         # one node stands for a narrow posterior: its width is that of the Gaussian at the mode
         blur = np.linalg.inv(found["H"]) if K == 1 and phi.shape[1] else np.zeros((phi.shape[1], phi.shape[1]))
-        sd[free] = np.sqrt(weight @ (s - m) ** 2 + m**2 * np.diagonal(blur)[: free.size])
+        sd[free] = np.sqrt(weight @ (s - m) ** 2 + (power * m) ** 2 * np.diagonal(blur)[: free.size])
         for k, j in enumerate(free):
             order = np.argsort(s[:, k])
             below = np.cumsum(weight[order])
@@ -502,6 +514,8 @@ def nodes(q: int, count: int) -> tuple[Array, Array]:
 
 
 def _diagonal(part: Gaussian) -> bool:
+    if not part.known:
+        return True
     R = part.cov()
     if not R.constant:
         return False
