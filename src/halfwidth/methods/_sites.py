@@ -4,8 +4,8 @@
 its seen outputs, ``h'x - y = e``, and the bounds. An unseen output that a seen one is correlated with through F is
 eliminated, and its half-width counts as variance of that row (as in `_residuals`).
 
-A Gaussian part of unknown variance is one of independent entries: its standard deviations are groups of their own, after
-the half-widths (q, r). Its rows are taken as they are, since nothing can be whitened that is not known.
+A Gaussian part of unknown variances has independent entries: its standard deviations are groups of their own, after the
+half-widths (q, r). Its rows are taken as they are, since nothing can be whitened that is not known.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Sites:
     uniform : (p,) bool array
         Which entries have a half-width at all.
     fitted : (p,) bool array
-        Which entries have an unknown variance.
+        Which entries belong to a noise with unknown variances; `free` says which are.
     row, output : (K,) int arrays
         Row of the record and output of each row of the chain; -1 where it is a bound.
     """
@@ -87,9 +87,8 @@ class Sites:
         if not keep.any():
             return None
         rows = {k: np.ascontiguousarray(p[k][keep]) for k in ("h", "y", "kind", "group", "R", "lo", "hi")}
-        rows["group_R"] = None
         before = np.concatenate([[0], np.cumsum(keep)])
-        return p | rows | {"lost": None, "mix": None, "start": before[p["start"]].astype(np.int32)}
+        return p | rows | {"lost": None, "mix": None, "group_R": None, "start": before[p["start"]].astype(np.int32)}
 
     @property
     def exact(self) -> bool:
@@ -107,13 +106,13 @@ def sites(model: Linear, record: Record, *, outliers: bool = False) -> Sites:
     floor, cap, uniform, fitted = _groups(model)
     p = len(floor)
     scale = np.resize(first_scales(model, [record.y[record.seen[:, j], j] for j in range(ny)]), p)
-    floor = np.where(fitted, np.minimum(np.maximum(floor, _LEAST * scale), cap), floor)
+    floor = np.where(fitted & (floor < cap), np.minimum(np.maximum(floor, _LEAST * scale), cap), floor)
     problem: dict[str, Any] = {"groups": p, "wide": WIDE}
     _dynamics(problem, model, record, dt)
     _first_state(problem, model, record)
     w_group = np.where(uniform[:nx] & (cap[:nx] > 0), np.arange(nx), -1)
     problem["group_w"] = w_group.astype(np.int32)
-    of_w = fitted[nx + ny :][:nx]
+    of_w = (fitted & (floor < cap))[nx + ny :][:nx]
     problem["group_Q"] = np.where(of_w, nx + ny + np.arange(nx), -1).astype(np.int32) if of_w.any() else None
     rows = _outputs(model, record, dt, scale, outliers)
     rows += _bounds(model, T, p)
@@ -139,7 +138,7 @@ def sites(model: Linear, record: Record, *, outliers: bool = False) -> Sites:
         problem[name] = joined(name, dtype)
     problem["lost"] = joined("lost", float) if (problem["kind"] == MAYBE_LOST).any() else None
     problem["mix"] = joined("mix", float, (p,)) if any(r.mix.any() for r in rows) else None
-    group_R = joined("group_R", np.int32)
+    group_R = joined("deviation", np.int32)
     problem["group_R"] = group_R if (group_R >= 0).any() else None
     output = joined("output", np.intp)
     count = np.resize(np.r_[np.full(nx, float(T)), [float(np.count_nonzero(output == j)) for j in range(ny)]], p)
@@ -158,10 +157,11 @@ def _groups(model: Linear) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.
     floor, cap, uniform = _half_widths(model)
     if groups(model) == len(floor):
         return floor, cap, uniform, np.zeros(len(floor), dtype=bool)
-    ends = [np.sqrt(_ends(gaussian_part(noise), n)) for noise, n in ((model.w, model.nx), (model.e, model.ny))]
-    lo, hi = np.concatenate(ends, axis=1)
+    of = [(gaussian_part(noise), n) for noise, n in ((model.w, model.nx), (model.e, model.ny))]
+    lo, hi = np.sqrt(np.concatenate([_ends(part, n) for part, n in of], axis=1))
+    asked = np.concatenate([np.full(n, part is not None and not part.known) for part, n in of])
     no = np.zeros(len(floor), dtype=bool)
-    return np.r_[floor, lo], np.r_[cap, hi], np.r_[uniform, no], np.r_[no, lo < hi]
+    return np.r_[floor, lo], np.r_[cap, hi], np.r_[uniform, no], np.r_[no, asked]
 
 
 def _ends(part: Gaussian | None, n: int) -> Array:
@@ -172,7 +172,7 @@ def _ends(part: Gaussian | None, n: int) -> Array:
 
 
 def _half_widths(model: Linear) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return floors and caps of the half-widths (q, r), 0 where a noise has none, and which have one; each (nx + ny,)."""
+    """Return floors and caps of the half-widths (q, r), 0 where a noise has none, and which have one, (nx + ny,)."""
     parts: list[tuple[Array, Array, NDArray[np.bool_]]] = []
     for noise, n in ((model.w, model.nx), (model.e, model.ny)):
         box = uniform_part(noise)
@@ -198,7 +198,7 @@ def gaussian_part(noise: Noise) -> Gaussian | None:
 
 
 def given(part: Gaussian, n: int) -> Varying | None:
-    """Return the covariance of a Gaussian part, without the entries whose variance is to be found; None if none is left."""
+    """Return the covariance of a Gaussian part without the entries whose variance is to be found, None if none is left."""
     if part.known:
         return part.cov()
     lo, hi = _ends(part, n)
@@ -284,14 +284,14 @@ class _Rows:
     lost: Array
     mix: Array
     output: NDArray[np.intp]
-    group_R: NDArray[np.int32]
+    deviation: NDArray[np.int32]
 
     @classmethod
     def of(cls, p: int, stage: NDArray[np.intp], h: Array, kind: Any, **more: Any) -> "_Rows":
         """Fill in what a kind of row does not have."""
         K = len(stage)
         none = {"y": np.zeros(K), "group": np.full(K, -1), "R": np.zeros(K), "lo": np.zeros(K), "hi": np.zeros(K)}
-        none |= {"lost": np.zeros(K), "mix": np.zeros((K, p)), "output": np.full(K, -1), "group_R": np.full(K, -1)}
+        none |= {"lost": np.zeros(K), "mix": np.zeros((K, p)), "output": np.full(K, -1), "deviation": np.full(K, -1)}
         return cls(stage=stage, h=h, kind=np.broadcast_to(np.asarray(kind, dtype=np.int8), (K,)), **(none | more))
 
 
@@ -335,7 +335,7 @@ def _outputs(model: Linear, record: Record, dt: Array, scale: Array, outliers: b
     else:
         kind = np.where((R[t, j] > 0) | (group_R >= 0) | mix.any(axis=1), UNIFORM_GAUSSIAN, UNIFORM)
     more |= {"y": y[t, j], "R": np.array(R[t, j]), "group": nx + j if box is not None else np.full(len(t), -1)}
-    return [_Rows.of(p, t + 1, C[t, j], kind, mix=mix, output=j, group_R=group_R, **more)]
+    return [_Rows.of(p, t + 1, C[t, j], kind, mix=mix, output=j, deviation=group_R, **more)]
 
 
 def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) -> list[_Rows]:

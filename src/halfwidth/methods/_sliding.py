@@ -54,8 +54,9 @@ TOL = 1e-8
 
 
 class Solved(NamedTuple):
-    """One window: states (rows + 1, nx), theta, half-widths (nx + ny,), how it went, the spread of its rows, and variances
-    (nx + ny,) where some are unknown; NaN where there is none.
+    """One window: states (rows + 1, nx), theta, half-widths (nx + ny,), how it went, the spread of its rows, variances.
+
+    Variances (nx + ny,) are None where none is unknown; NaN stands for an entry that has none, as in half-widths.
     """
 
     x: Array
@@ -395,9 +396,8 @@ class Sliding:
 
 def _both(of_w: Array | None, of_e: Array | None, model: Model) -> Array:
     """Return what belongs to states and outputs side by side, NaN where there is none."""
-    return np.r_[
-        np.full(model.nx, np.nan) if of_w is None else of_w, np.full(model.ny, np.nan) if of_e is None else of_e
-    ]
+    parts = [np.full(n, np.nan) if part is None else part for part, n in ((of_w, model.nx), (of_e, model.ny))]
+    return np.concatenate(parts)
 
 
 def if_found(values: Array, status: Status) -> Array | None:

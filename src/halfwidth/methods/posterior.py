@@ -100,14 +100,13 @@ class Posterior:
     half-widths and entries, and ``ess``, their smallest effective number of draws; the status is REDUCED above an R-hat
     of 1.01 and STALLED above 1.05. Of "ep":
 
-    ``q``, ``r`` are posterior means, ``Q``, ``R`` those of unknown variances. ``loglik`` is the logarithm of the evidence, half-widths integrated out under a
-    prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
-    count as a factor in 26 rows and as a condition in the others. In ``info``: ``x0``; ``half_widths``, a mapping
-    with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %) of (q, r); ``variances``, the same of (Q, R) where some are
-    unknown; ``outliers``, the named outputs with a
-    probability above one half; ``residual``,
-    the disagreement of moments in standard deviations, the largest of each node; ``sweeps``; ``nodes`` and their
-    ``effective`` number.
+    ``q``, ``r`` are posterior means, ``Q``, ``R`` those of unknown variances. ``loglik`` is the logarithm of the
+    evidence, half-widths and standard deviations integrated out under a prior one unit of log s wide around their mode,
+    so that models with more unknowns do not win by that alone; bounds count as a factor in 26 rows and as a condition
+    in the others. In ``info``: ``x0``; ``half_widths``, a mapping with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %)
+    of (q, r); ``variances``, the same of (Q, R) where some are unknown; ``outliers``, the named outputs with a
+    probability above one half; ``residual``, the disagreement of moments in standard deviations, the largest of each
+    node; ``sweeps``; ``nodes`` and their ``effective`` number.
 
     Raises
     ------

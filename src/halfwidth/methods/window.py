@@ -87,11 +87,10 @@ class Window:
     -----
     ``x[k]`` is the state of row k in the window that ends at row k + `lag`, or at the last one. In ``info``:
     ``smoothed`` (T, nx), the last estimate of each state; ``low``, ``high`` and ``windows``, what `ensemble_interval`
-    needs; ``q``, ``r``, ``theta`` of every window, and ``Q``, ``R`` where variances are unknown; ``start``, ``extrapolated``, ``since_fix``, ``statuses``,
-    ``iterations`` and, of ``BatchLP``,
-    ``seconds`` of CPU time of every row; ``newest_low``, ``newest_high``, ``newest_windows``, what
-    ``ensemble_interval(newest=True)`` needs. Those of the estimate itself are the last window's; its status is
-    the worst of all windows.
+    needs; ``q``, ``r``, ``theta`` of every window, and ``Q``, ``R`` where variances are unknown; ``start``,
+    ``extrapolated``, ``since_fix``, ``statuses``, ``iterations`` and, of ``BatchLP``, ``seconds`` of CPU time of every
+    row; ``newest_low``, ``newest_high``, ``newest_windows``, what ``ensemble_interval(newest=True)`` needs. Those of
+    the estimate itself are the last window's; its status is the worst of all windows.
 
     Raises
     ------
