@@ -198,7 +198,7 @@ def gaussian_part(noise: Noise) -> Gaussian | None:
 
 
 def given(part: Gaussian, n: int) -> Varying | None:
-    """Return the covariance of a Gaussian part without the entries whose variance is to be found, None if none is left."""
+    """Return the covariance of a Gaussian part without entries whose variance is to be found, None if none is left."""
     if part.known:
         return part.cov()
     lo, hi = _ends(part, n)
