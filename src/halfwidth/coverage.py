@@ -78,10 +78,12 @@ class Coverage:
         ax.set_ylim(0, 1.02)
         ax.set_xlabel("level asked")
         ax.set_ylabel("share of states inside; shaded: 99 % of honest ones")
-        ax.legend(loc="upper left", fontsize="small")
+        ax.legend(loc="lower right", fontsize="small")
         return ax
 
     def __repr__(self) -> str:
+        if self.guaranteed:
+            return f"{self.method}, guaranteed: {self.inside[0]:.1%} inside"
         lines = [f"{self.method}, worth {self.trials} trials", "level   inside   99 % of honest ones"]
         lines += [
             f"{p:5.0%}  {s:7.1%}   {a:6.1%} to {b:6.1%}"
@@ -131,7 +133,7 @@ class Ranks:
 
     @classmethod
     def _from(cls, counts: Array, total: int) -> "Ranks":
-        """`counts` (pieces, bins): share of each bin in each piece."""
+        """Return the ranks of pieces whose shares of each bin are `counts` (pieces, bins)."""
         even = np.full(counts.shape[1], 1.0 / counts.shape[1])
         trials = _trials(counts, even, total)
         lo, hi = _band(even[:1], trials)
@@ -166,8 +168,8 @@ class Ranks:
     def __repr__(self) -> str:
         shares = " ".join(f"{100 * s:.1f}" for s in self.shares)
         return (
-            f"ranks worth {self.trials} trials, share of each bin, %: {shares}\n99 % of even ones: {100 * self.lo:.1f} to "
-            f"{100 * self.hi:.1f}; probability of one as uneven {self.chi2:.2g}"
+            f"ranks worth {self.trials} trials, share of each bin, %: {shares}\n"
+            f"99 % of even ones: {100 * self.lo:.1f} to {100 * self.hi:.1f}; probability of one as uneven {self.chi2:.2g}"
         )
 
 
@@ -180,7 +182,7 @@ def coverage(estimates: Estimate | Sequence[Estimate], truths: Any, *, levels: A
         Of one method; each of its own record.
     truths : (T, nx) array_like or Truth, or a sequence of them
     levels : (k,) array_like, optional
-        .05, .1, ..., .95 and .99 if absent.
+        .1, .2, ..., .9, .95 and .99 if absent.
 
     Raises
     ------
@@ -198,7 +200,7 @@ def coverage(estimates: Estimate | Sequence[Estimate], truths: Any, *, levels: A
     True
     """
     ests, true = _pairs(estimates, truths)
-    p = np.r_[np.arange(1, 20) / 20, 0.99] if levels is None else np.atleast_1d(real(levels, "levels"))
+    p = np.r_[np.arange(1, 10) / 10, 0.95, 0.99] if levels is None else np.atleast_1d(real(levels, "levels"))
     if np.any((p <= 0) | (p >= 1)):
         raise BadValue(f"`levels` runs from {p.min():g} to {p.max():g}, shares between 0 and 1 were expected")
     held = []  # (rows, k) of each record: share of its states inside
