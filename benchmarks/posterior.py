@@ -13,6 +13,7 @@ half-widths from the prior that is used, without bounds. `WINDOWS=500` sets the 
 as many. `PICTURES=folder` writes the diagrams of `calibration` and `pictures` there.
 """
 
+import dataclasses
 import os
 import sys
 import time
@@ -26,7 +27,7 @@ import halfwidth as hw  # noqa: E402
 from halfwidth.methods import posterior  # noqa: E402
 from halfwidth.methods._sliding import Sliding, stacked  # noqa: E402
 from halfwidth.reproduce.paper003 import BOX, KAPPA, A, B, C, E, F, Q, R  # noqa: E402
-from halfwidth.spread import part  # noqa: E402
+from halfwidth.spread import part as rows_of  # noqa: E402
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 WINDOWS = int(os.environ.get("WINDOWS", "500"))
@@ -344,8 +345,8 @@ def ensemble():
             paper = hw.Window(hw.BatchLP(objective="paper", point="optimal"), 25, fixes=0)
             theirs.append(hw.estimate(model, record, paper))
             states.append(X[1:][rows])
-            for name, spread in lagged(model, record, (0, 12, 25)).items():
-                ours.setdefault(name, []).append(part(spread, rows))
+            for name, spread in lagged(model, record).items():
+                ours.setdefault(name, []).append(rows_of(spread, rows))
         for kappa in KAPPA:
             ends = [hw.ensemble_interval(est, kappa) for est in theirs]
             ends = [(lo[rows], hi[rows]) for lo, hi in ends]
@@ -370,17 +371,23 @@ def along(path, seed, *, correlated=False, missing=0.0):
     return X, hw.Record(np.arange(1.0, LONG + 1), y, u)
 
 
-def lagged(model, record, lags):
-    """Return the spread of every row from windows that carry and end so many rows later, and from windows alone."""
-    found = {f"stream, lag {lag}": [] for lag in lags} | {"alone, lag 12": []}
-    for recall, chosen in ((40.0, lags), (0.0, (12,))):
-        rows = Sliding(hw.Window(hw.Posterior(nodes=32), 25, recall=recall), model, 0.0)
+def lagged(model, record):
+    """Return the spread of every row from windows that end so many rows later: carrying, alone, and told q and r."""
+    told = dataclasses.replace(model, w=hw.Uniform(Q), e=hw.Uniform(R))
+    found = {}
+    for kind, asked, recall, lags in (
+        ("", model, 40.0, (0, 12, 25)),
+        ("alone", model, 0.0, (12,)),
+        ("told", told, 40.0, (25,)),
+    ):
+        rows = Sliding(hw.Window(hw.Posterior(nodes=32), 25, recall=recall), asked, 0.0)
+        names = {lag: f"{kind} lag {lag}".strip() for lag in lags}
+        found |= {name: [] for name in names.values()}
         for t in range(len(record)):
             solved = rows.push(record.y[t], record.u[t], 1.0)
-            for lag in chosen:
+            for lag, name in names.items():
                 if t >= lag:
-                    name = f"stream, lag {lag}" if recall else f"alone, lag {lag}"
-                    found[name].append(part(solved.spread, slice(-1 - lag, -lag or None)))
+                    found[name].append(rows_of(solved.spread, slice(-1 - lag, -lag or None)))
     return {name: stacked(spreads) for name, spreads in found.items()}
 
 

@@ -169,7 +169,7 @@ class Ranks:
         shares = " ".join(f"{100 * s:.1f}" for s in self.shares)
         return (
             f"ranks worth {self.trials} trials, share of each bin, %: {shares}\n"
-            f"99 % of even ones: {100 * self.lo:.1f} to {100 * self.hi:.1f}; probability of one as uneven {self.chi2:.2g}"
+            f"99 % of even ones: {100 * self.lo:.1f} to {100 * self.hi:.1f}; chance of one as uneven {self.chi2:.2g}"
         )
 
 

@@ -261,7 +261,7 @@ class Posterior:
                 start = Start(np.where(quick.chain.free, quick.start.s, problem.guess), None)
         known = None if known is None else known.of(problem.free)
         found = self._solve(problem, model, start, known)
-        return Answer(self._estimate(problem, found, model, record), problem, found, known)
+        return Answer(self._estimate(problem, found, model, record), problem, found, known, self._rate(model)[0])
 
     def _solve(self, chain: Sites, model: Linear, start: "Start | None", known: Known | None) -> dict[str, Any]:
         rate, learn_rate, beta = self._rate(model)
@@ -413,12 +413,13 @@ class Start(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """An estimate, its chain, what the core found and what it was told beforehand."""
+    """An estimate, its chain, what the core found, what it was told beforehand, and the rate of outliers if told."""
 
     estimate: Estimate
     chain: Sites
     found: dict[str, Any]
     known: Known | None
+    rate: float = 0.0
 
     @property
     def start(self) -> Start:
