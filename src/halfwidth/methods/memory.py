@@ -272,7 +272,7 @@ def output_errors(model: Linear, record: Record, k: int, x: Array) -> Array:
     t, step = float(record.t[k]), float(record.steps(model.dt)[k])
     y: Array = model.C.at(t, step, k) @ x
     if model.F is not None:
-        y = np.linalg.solve(model.F.at(t, step, k), y)
+        y = np.asarray(np.linalg.solve(model.F.at(t, step, k), y))
     return np.asarray(np.where(record.seen[k], record.y[k] - y, np.nan))
 
 
