@@ -184,7 +184,7 @@ def stream_case(delta, *, correlated=False, missing=0.0, seed=11, model=None, re
     for path in range(paths):
         X, record = along(path, seed, correlated=correlated, missing=missing)
         kf = told_the_truth(record, correlated=correlated)
-        rows = Sliding(hw.Window(hw.Posterior(nodes=32), delta, recall=recall), model, 0.0)
+        rows = Sliding(hw.Window(hw.Posterior(nodes=32), delta, recall=recall, lag=mid), model, 0.0)
         off, hit, learned = [], [], []
         for t in range(LONG):  # what `lag=0` and `lag=mid` give, in one run
             start = time.process_time()
@@ -380,7 +380,7 @@ def lagged(model, record):
         ("alone", model, 0.0, (12,)),
         ("told", told, 40.0, (25,)),
     ):
-        rows = Sliding(hw.Window(hw.Posterior(nodes=32), 25, recall=recall), asked, 0.0)
+        rows = Sliding(hw.Window(hw.Posterior(nodes=32), 25, recall=recall, lag=max(lags)), asked, 0.0)
         names = {lag: f"{kind} lag {lag}".strip() for lag in lags}
         found |= {name: [] for name in names.values()}
         for t in range(len(record)):

@@ -8,6 +8,7 @@ A Gaussian part of unknown variances has independent entries: its standard devia
 half-widths (q, r). Its rows are taken as they are, since nothing can be whitened that is not known.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,17 +69,8 @@ class Sites:
     @property
     def guess(self) -> Array:
         """Generous first values of all groups from the data's scale, (p,)."""
-        size = np.where(self.fitted, self.scale, np.sqrt(3.0) * self.scale)
-        return np.where(self.uniform | self.fitted, np.clip(size, self.floor, self.cap), 0.0)
-
-    def variances(self, s: Array) -> tuple[Array, Array]:
-        """Return what groups s (p,) add to the Gaussian noise of each state (nx,) and of each row of the chain (K,)."""
-
-        def of(group: Any, n: int) -> Array:
-            return np.zeros(n) if group is None else np.where(group >= 0, s[group] ** 2, 0.0)
-
-        p = self.problem
-        return of(p["group_Q"], len(p["m0"])), of(p["group_R"], len(p["kind"]))
+        size = np.where(self.fitted, self.scale, math.sqrt(3.0) * self.scale)
+        return np.where(self.uniform | self.fitted, size.clip(self.floor, self.cap), 0.0)
 
     @property
     def outside(self) -> dict[str, Any] | None:
@@ -99,24 +91,100 @@ class Sites:
         )
 
 
-def sites(model: Linear, record: Record, *, outliers: bool = False) -> Sites:
-    """Build the chain of a model without unknown entries."""
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What the chains of one model have in common in all windows of the same rows seen.
+
+    Parameters
+    ----------
+    problem : dict
+        The entries of `Sites.problem` that no data are in.
+    B : (nx, nu) array or None
+        Inputs to what is added to the state; None: as the rows of the record have it.
+    Y : (K, ny) array
+        Seen outputs of its row to the target of each row of the chain.
+    R : (ny,) array
+        Variances of Gaussian outputs; infinite where the noise has a bounded part.
+    """
+
+    problem: dict[str, Any]
+    free: NDArray[np.bool_]
+    floor: Array
+    cap: Array
+    count: Array
+    uniform: NDArray[np.bool_]
+    fitted: NDArray[np.bool_]
+    row: NDArray[np.intp]
+    output: NDArray[np.intp]
+    B: Array | None
+    Y: Array
+    R: Array
+
+    def fits(self, scale: Array, top: float) -> bool:
+        """Say whether no variance is so small beside outputs of these scales (p,) and this size that it is lifted."""
+        return bool((2.0 * _EXACT * np.maximum(scale[-len(self.R) :], math.sqrt(_EXACT) * top) ** 2 < self.R).all())
+
+
+#: Frames that are kept of one model.
+_FRAMES = 64
+
+
+def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict[bytes, Frame] | None = None) -> Sites:
+    """Build the chain of a model without unknown entries.
+
+    `frames` keeps what windows of one model have in common, where its matrices are constant.
+    """
+    y = np.where(record.seen, record.y, 0.0)
+    scale = first_scales(model, [record.y[record.seen[:, j], j] for j in range(model.ny)])
+    kept, frame = b"", None
+    if frames is not None and isinstance(model.x0, Normal):
+        kept = record.seen.tobytes()
+        frame = frames.get(kept)
+    if frame is None or not frame.fits(scale, float(np.abs(y).max())):
+        frame = _frame(model, record, scale, outliers)
+        if frames is not None and kept and _constant(model):
+            if len(frames) >= _FRAMES:
+                del frames[next(iter(frames))]
+            frames[kept] = frame
+    problem = frame.problem | _first_state(model, record)
+    if frame.B is None:
+        problem["b"] = _added(model, record)
+    else:
+        problem["b"] = np.zeros((len(record), model.nx)) if record.u is None else record.u @ frame.B.T
+    # bounds have no output, and the target 0
+    problem["y"] = np.einsum("kj,kj->k", frame.Y, y[np.maximum(frame.row, 0)])
+    floor, cap, fitted = frame.floor, frame.cap, frame.fitted
+    if fitted.any():
+        scale = np.resize(scale, len(fitted))
+        floor = np.where(fitted & (floor < cap), np.minimum(np.maximum(floor, _LEAST * scale), cap), floor)
+    return Sites(problem, frame.free, floor, cap, scale, frame.count, frame.uniform, fitted, frame.row, frame.output)
+
+
+def _constant(model: Linear) -> bool:
+    """Say whether a frame of the model serves other rows."""
+    noises = [part for part in (gaussian_part(model.w), gaussian_part(model.e)) if part is not None]
+    covs = [part.cov() for part in noises if part.known]
+    return (
+        model.loss is None
+        and all(m.value is not None and m.value.ndim == 2 for m in (*model.matrices.values(), *covs))
+        and all(part.known or bool(np.less(*_ends(part, 1)).all()) for part in noises)
+    )
+
+
+def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame:
     T, nx, ny = len(record), model.nx, model.ny
     dt = record.steps(model.dt)
     floor, cap, uniform, fitted = _groups(model)
     p = len(floor)
-    scale = np.resize(first_scales(model, [record.y[record.seen[:, j], j] for j in range(ny)]), p)
-    floor = np.where(fitted & (floor < cap), np.minimum(np.maximum(floor, _LEAST * scale), cap), floor)
     problem: dict[str, Any] = {"groups": p, "wide": WIDE}
     _dynamics(problem, model, record, dt)
-    _first_state(problem, model, record)
     w_group = np.where(uniform[:nx] & (cap[:nx] > 0), np.arange(nx), -1)
     problem["group_w"] = w_group.astype(np.int32)
     of_w = (fitted & (floor < cap))[nx + ny :][:nx]
     problem["group_Q"] = np.where(of_w, nx + ny + np.arange(nx), -1).astype(np.int32) if of_w.any() else None
     rows = _outputs(model, record, dt, scale, outliers)
-    rows += _bounds(model, T, p)
-    rows += _first_bounds(model, p)
+    rows += _bounds(model, T)
+    rows += _first_bounds(model)
     stage = np.concatenate([r.stage for r in rows]) if rows else np.zeros(0, dtype=np.intp)
     order = np.argsort(stage, kind="stable")
     problem["start"] = np.searchsorted(stage[order], np.arange(T + 2)).astype(np.int32)
@@ -127,14 +195,7 @@ def sites(model: Linear, record: Record, *, outliers: bool = False) -> Sites:
         return np.ascontiguousarray(np.concatenate([getattr(r, name) for r in rows])[order], dtype=dtype)
 
     problem["h"] = joined("h", float, (nx,))
-    for name, dtype in (
-        ("y", float),
-        ("kind", np.int8),
-        ("group", np.int32),
-        ("R", float),
-        ("lo", float),
-        ("hi", float),
-    ):
+    for name, dtype in (("kind", np.int8), ("group", np.int32), ("R", float), ("lo", float), ("hi", float)):
         problem[name] = joined(name, dtype)
     problem["lost"] = joined("lost", float) if (problem["kind"] == MAYBE_LOST).any() else None
     problem["mix"] = joined("mix", float, (p,)) if any(r.mix.any() for r in rows) else None
@@ -143,7 +204,16 @@ def sites(model: Linear, record: Record, *, outliers: bool = False) -> Sites:
     output = joined("output", np.intp)
     count = np.resize(np.r_[np.full(nx, float(T)), [float(np.count_nonzero(output == j)) for j in range(ny)]], p)
     free = (uniform | fitted) & (floor < cap) & (count > 0)
-    return Sites(problem, free, floor, cap, scale, count, uniform, fitted, stage[order] - 1, output)
+    B = None
+    if all(m is None or m.constant for m in (model.B, model.E)):
+        B = np.zeros((nx, model.nu)) if model.B is None else model.B.single
+        B = B if problem["G"] is None else problem["G"][0] @ B
+    part = gaussian_part(model.e)
+    R = np.full(ny, np.inf)
+    if part is not None and uniform_part(model.e) is None and part.known and part.cov().constant:
+        R = np.diagonal(part.cov().single)
+    Y = joined("Y", float, (ny,))
+    return Frame(problem, free, floor, cap, count, uniform, fitted, stage[order] - 1, output, B, Y, R)
 
 
 def groups(model: Model) -> int:
@@ -218,42 +288,45 @@ def _one(matrix: Varying | None, record: Record, dt: Array) -> tuple[Array, NDAr
 
 
 def _dynamics(problem: dict[str, Any], model: Linear, record: Record, dt: Array) -> None:
-    T, nx = len(record), model.nx
     part = gaussian_part(model.w)
     problem["G"] = problem["G_index"] = problem["Q"] = problem["Q_index"] = None
     A, A_index = _one(model.A, record, dt)
-    b = np.zeros((T, nx))
-    if model.B is not None and record.u is not None:
-        b = np.einsum("tij,tj->ti", _every(model.B, record, dt), record.u)
-    Q = None if part is None else given(part, nx)
+    Q = None if part is None else given(part, model.nx)
     if Q is not None:
         problem["Q"], problem["Q_index"] = _one(Q, record, dt)
     if model.E is not None:
         if model.E.constant:
             G = np.linalg.inv(model.E.single)[None]
             A = G @ A
-            b = b @ G[0].T
             if Q is not None:
                 problem["Q"] = G @ problem["Q"] @ G[0].T
         else:
             G = np.linalg.inv(_every(model.E, record, dt))
             A, A_index = G @ _every(model.A, record, dt), None
-            b = np.einsum("tij,tj->ti", G, b)
             if Q is not None:
                 problem["Q"], problem["Q_index"] = G @ _every(Q, record, dt) @ np.swapaxes(G, 1, 2), None
         problem["G"] = np.ascontiguousarray(G, dtype=float)
     if problem["Q"] is not None:
         problem["Q"] = np.ascontiguousarray(problem["Q"], dtype=float)
     problem["A"], problem["A_index"] = np.ascontiguousarray(A, dtype=float), A_index
-    problem["b"] = np.ascontiguousarray(b)
 
 
-def _first_state(problem: dict[str, Any], model: Linear, record: Record) -> None:
-    """Put the prior of x0: Gaussian, uniform in a box, or so wide that it says nothing where the box has no end."""
+def _added(model: Linear, record: Record) -> Array:
+    """Return what inputs add to the state of each row, (T, nx), where a matrix varies."""
+    b: Array = np.zeros((len(record), model.nx))
+    dt = record.steps(model.dt)
+    if model.B is not None and record.u is not None:
+        b = np.einsum("tij,tj->ti", _every(model.B, record, dt), record.u)
+    if model.E is not None:
+        b = np.linalg.solve(_every(model.E, record, dt), b[:, :, None])[:, :, 0]
+    return np.ascontiguousarray(b)
+
+
+def _first_state(model: Linear, record: Record) -> dict[str, Any]:
+    """Return the prior of x0: Gaussian, uniform in a box, or so wide that it says nothing where the box has no end."""
     x0, nx = model.x0, model.nx
     if isinstance(x0, Normal):
-        problem |= {"m0": np.array(x0.mean), "P0": np.array(x0.P), "half0": np.zeros(nx)}
-        return
+        return {"m0": np.ascontiguousarray(x0.mean), "P0": np.ascontiguousarray(x0.P), "half0": np.zeros(nx)}
     assert isinstance(x0, Box)
     finite = np.isfinite(x0.lo) & np.isfinite(x0.hi)
     m0, half = np.array(x0.mean), np.where(finite, 0.5 * (x0.hi - x0.lo), 0.0)
@@ -266,7 +339,7 @@ def _first_state(problem: dict[str, Any], model: Linear, record: Record) -> None
         wide = np.maximum(1e3 * base.column[:nx], 10.0 * np.abs(base.X[:nx]))
         m0 = np.where(finite, m0, base.X[:nx])
         P0 = np.diag(np.where(finite, 0.0, wide**2))
-    problem |= {"m0": np.ascontiguousarray(m0, dtype=float), "P0": P0, "half0": half}
+    return {"m0": np.ascontiguousarray(m0, dtype=float), "P0": P0, "half0": half}
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +348,7 @@ class _Rows:
 
     stage: NDArray[np.intp]
     h: Array
-    y: Array
+    Y: Array  # (K, ny): seen outputs of the row to the target
     kind: NDArray[np.int8]
     group: NDArray[np.int32]
     R: Array
@@ -287,10 +360,16 @@ class _Rows:
     deviation: NDArray[np.int32]
 
     @classmethod
-    def of(cls, p: int, stage: NDArray[np.intp], h: Array, kind: Any, **more: Any) -> "_Rows":
+    def of(cls, model: Linear, stage: NDArray[np.intp], h: Array, kind: Any, **more: Any) -> "_Rows":
         """Fill in what a kind of row does not have."""
-        K = len(stage)
-        none = {"y": np.zeros(K), "group": np.full(K, -1), "R": np.zeros(K), "lo": np.zeros(K), "hi": np.zeros(K)}
+        K, p = len(stage), groups(model)
+        none = {
+            "Y": np.zeros((K, model.ny)),
+            "group": np.full(K, -1),
+            "R": np.zeros(K),
+            "lo": np.zeros(K),
+            "hi": np.zeros(K),
+        }
         none |= {"lost": np.zeros(K), "mix": np.zeros((K, p)), "output": np.full(K, -1), "deviation": np.full(K, -1)}
         return cls(stage=stage, h=h, kind=np.broadcast_to(np.asarray(kind, dtype=np.int8), (K,)), **(none | more))
 
@@ -302,19 +381,19 @@ def _outputs(model: Linear, record: Record, dt: Array, scale: Array, outliers: b
     if box is None and part is not None and part.known:
         return _gaussian_outputs(model, record, dt, scale)
     C, seen = _every(model.C, record, dt), record.seen
-    y = np.where(seen, record.y, 0.0)
     t, j = np.nonzero(seen)
+    Y = np.eye(ny)[j]
     R = np.zeros((T, ny))
     own = None if part is None else given(part, ny)
     if own is not None:
         R = np.diagonal(_every(own, record, dt), axis1=1, axis2=2)
     lo, hi = _ends(part, ny)
-    group_R = np.where(lo < hi, once + nx + np.arange(ny), -1)[j]
+    deviation = np.where(lo < hi, once + nx + np.arange(ny), -1)[j]
     mix = np.zeros((len(t), p))
     if model.F is not None:
         F = _every(model.F, record, dt)
         N = _eliminate(F, seen)
-        C, y = N @ C, np.einsum("tij,tj->ti", N @ F, y)
+        C, Y = N @ C, (N @ F)[t, j]
         R = np.einsum("tij,tj->ti", N**2, R)
         others = np.where(np.eye(ny)[j] > 0, 0.0, N[t, j] ** 2)
         if box is not None:
@@ -331,16 +410,16 @@ def _outputs(model: Linear, record: Record, dt: Array, scale: Array, outliers: b
         kind = np.full(len(t), GAUSSIAN)
         floor = _EXACT * scale[nx + j] ** 2  # of a known variance beside unknown ones
         R = R.copy()
-        R[t, j] = np.where(group_R < 0, np.maximum(R[t, j], floor), R[t, j])
+        R[t, j] = np.where(deviation < 0, np.maximum(R[t, j], floor), R[t, j])
     else:
-        kind = np.where((R[t, j] > 0) | (group_R >= 0) | mix.any(axis=1), UNIFORM_GAUSSIAN, UNIFORM)
-    more |= {"y": y[t, j], "R": np.array(R[t, j]), "group": nx + j if box is not None else np.full(len(t), -1)}
-    return [_Rows.of(p, t + 1, C[t, j], kind, mix=mix, output=j, deviation=group_R, **more)]
+        kind = np.where((R[t, j] > 0) | (deviation >= 0) | mix.any(axis=1), UNIFORM_GAUSSIAN, UNIFORM)
+    more |= {"R": np.array(R[t, j]), "group": nx + j if box is not None else np.full(len(t), -1)}
+    return [_Rows.of(model, t + 1, C[t, j], kind, Y=Y, mix=mix, output=j, deviation=deviation, **more)]
 
 
 def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) -> list[_Rows]:
     """Whiten the seen outputs of each row."""
-    nx, p = model.nx, groups(model)
+    nx, ny = model.nx, model.ny
     part = gaussian_part(model.e)
     assert part is not None
     C, R = _every(model.C, record, dt), _every(part.cov(), record, dt)
@@ -363,9 +442,9 @@ def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) ->
         )
         if model.loss is not None:  # a loss strikes one sensor: `refused` has seen to a diagonal R
             for a, j in enumerate(s):
-                more = {"y": y[t, j], "R": part_R[:, a, a], "output": np.full(t.size, j)}
+                more = {"Y": np.tile(np.eye(ny)[j], (t.size, 1)), "R": part_R[:, a, a], "output": np.full(t.size, j)}
                 more["lost"] = _lost(model, record, dt, t, np.full(t.size, j))
-                found.append(_Rows.of(p, t + 1, C[t, j], MAYBE_LOST, **more))
+                found.append(_Rows.of(model, t + 1, C[t, j], MAYBE_LOST, **more))
             continue
         try:
             L = np.linalg.cholesky(part_R)
@@ -373,13 +452,14 @@ def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) ->
             spread = np.einsum("tii->t", part_R)[:, None, None] * 1e-12
             L = np.linalg.cholesky(part_R + spread * np.eye(s.size))
         h = np.linalg.solve(L, C[t][:, s])
-        white = np.linalg.solve(L, y[t][:, s, None])[:, :, 0]
+        white = np.zeros((t.size, s.size, ny))
+        white[:, :, s] = np.linalg.inv(L)
         # the whitened row keeps the unit of its output, so that its density is the output's own
         d = np.diagonal(L, axis1=1, axis2=2)
         for a, j in enumerate(s):
             found.append(
                 _Rows.of(
-                    p, t + 1, h[:, a] * d[:, a, None], GAUSSIAN, y=white[:, a] * d[:, a], R=d[:, a] ** 2,
+                    model, t + 1, h[:, a] * d[:, a, None], GAUSSIAN, Y=white[:, a] * d[:, a, None], R=d[:, a] ** 2,
                     output=np.full(t.size, j),
                 )
             )  # fmt: skip
@@ -399,7 +479,7 @@ def _lost(model: Linear, record: Record, dt: Array, t: NDArray[np.intp], j: NDAr
     return found
 
 
-def _bounds(model: Linear, T: int, p: int) -> list[_Rows]:
+def _bounds(model: Linear, T: int) -> list[_Rows]:
     if model.bounds is None:
         return []
     D, lo, hi = model.bounds.rows
@@ -409,10 +489,10 @@ def _bounds(model: Linear, T: int, p: int) -> list[_Rows]:
         return []
     K = len(D)
     stage, h = np.repeat(np.arange(1, T + 1), K), np.broadcast_to(D, (T, K, model.nx)).reshape(-1, model.nx)
-    return [_Rows.of(p, stage, h, TRUNCATION, lo=np.tile(lo, T), hi=np.tile(hi, T))]
+    return [_Rows.of(model, stage, h, TRUNCATION, lo=np.tile(lo, T), hi=np.tile(hi, T))]
 
 
-def _first_bounds(model: Linear, p: int) -> list[_Rows]:
+def _first_bounds(model: Linear) -> list[_Rows]:
     """One end of the box of x0 without the other is a bound of stage 0."""
     if not isinstance(model.x0, Box):
         return []
@@ -421,4 +501,4 @@ def _first_bounds(model: Linear, p: int) -> list[_Rows]:
     if not one.size:
         return []
     stage = np.zeros(one.size, dtype=np.intp)
-    return [_Rows.of(p, stage, np.eye(nx)[one], TRUNCATION, lo=model.x0.lo[one], hi=model.x0.hi[one])]
+    return [_Rows.of(model, stage, np.eye(nx)[one], TRUNCATION, lo=model.x0.lo[one], hi=model.x0.hi[one])]

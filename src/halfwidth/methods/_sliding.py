@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from halfwidth.array import Array
-from halfwidth.methods._carry import Carried, Known, Warm
+from halfwidth.methods._carry import Carried
 from halfwidth.methods._protocol import Estimator, pushed_row, typed
 from halfwidth.methods._residuals import reference, residuals
 from halfwidth.methods._sites import groups
 from halfwidth.methods.map import BatchLP
-from halfwidth.methods.posterior import Answer, Posterior
+from halfwidth.methods.posterior import Posterior
 from halfwidth.methods.sequential import (
     SequentialLP,
     expected,
@@ -243,7 +243,7 @@ class Sliding:
             if solved is not None:
                 return solved
             est = method.answer(model, part, contradiction=False)
-        elif isinstance(method, Posterior) and method.method == "ep" and not getattr(model, "theta_entries", ()):
+        elif self.carried is not None:
             est = self._posterior(model, part, a)
         else:
             est = method.run(model, part, seed=self.seed)
@@ -258,23 +258,15 @@ class Sliding:
 
     def _posterior(self, model: Model, part: Record, a: int) -> Estimate:
         """Estimate one window with what the rows before it told."""
-        held = self.carried
-        if held is None:
-            return self._answer(model, part, None, None, None).estimate
+        held, method = self.carried, self.window.method
+        assert held is not None
+        assert isinstance(method, Posterior)
         seen = np.asarray(part.seen.any(axis=1))
-        warm = None if held.warm is None else (held.warm, a)
-        answer = self._answer(model, part, held.s, held.known(self.first + a), warm)
+        answer = method.resumed(model, part, held, self.first + a, a, max(len(part) - self.window.lag, 0))
         newest = self.first + len(self.times) - 1
         rows = max(int(seen.sum()), self.window.memory + 1)
         held.take(answer, newest, rows, counts=bool(seen[-1]))
         return answer.estimate
-
-    def _answer(
-        self, model: Model, part: Record, s: Array | None, known: Known | None, warm: tuple[Warm, int] | None
-    ) -> Answer:
-        """Return the posterior of one window; see `Posterior.resumed`."""
-        assert isinstance(self.window.method, Posterior)
-        return self.window.method.resumed(model, part, s, known, warm)
 
     def _costs(self, model: Model, part: Record) -> Array:
         """Return the scales of the first full window, or of the rows there are."""

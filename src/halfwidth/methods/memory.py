@@ -24,10 +24,9 @@ import numpy as np
 import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadValue
-from halfwidth.methods._carry import Known, Warm
 from halfwidth.methods._protocol import Estimator
 from halfwidth.methods._sites import Sites, sites
-from halfwidth.methods._sliding import Sliding
+from halfwidth.methods._sliding import Sliding, Solved
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.posterior import Answer, Posterior
 from halfwidth.methods.sequential import expected, filled
@@ -189,27 +188,27 @@ class _Foretelling(Sliding):
         self.expected, self.density = np.asarray(model.x0.mean, dtype=float), math.nan
         self._near: Array | None = None  # half-widths of the row before: a good start
 
-    def _answer(
-        self, model: Model, part: Record, s: Array | None, known: Known | None, warm: tuple[Warm, int] | None
-    ) -> Answer:
+    def _solve(self, model: Model, part: Record, a: int) -> Solved:
         assert isinstance(model, Linear)
-        method = self.window.method
+        method, held = self.window.method, self.carried
         assert isinstance(method, Posterior)
+        solved = None if held is None else super()._solve(model, part, a)
+        known = held.gone if held is not None and held.gone.precision.any() else None
         y = part.y.copy()
         y[-1] = np.nan
-        s = self._near if s is None else s
-        before = super()._answer(model, Record(part.t, y, part.u), s, known, None)
-        self.expected, self.density = before.estimate.x[-1], math.nan
-        good = before.estimate.status.good
-        if good:
+        before = method.answer(model, Record(part.t, y, part.u), start=self._near, known=known)
+        est = before.estimate
+        self.expected, self.density = est.x[-1], math.nan
+        if est.status.good:
             self._near = before.start.s
-        if not good or not part.seen[-1].any():
-            return before if self.carried is None else super()._answer(model, part, s, known, warm)
-        self.density, surely = _density(method, before, model, part)
-        after = None if self.carried is None else super()._answer(model, part, s, known, warm)
-        if not surely:
-            self.density = _ratio(super()._answer(model, part, None, known, None), before)
-        return before if after is None else after
+            if part.seen[-1].any():
+                self.density, surely = _density(method, before, model, part)
+                if not surely:
+                    self.density = _ratio(method.answer(model, part, known=known), before)
+        if solved is None:  # nothing is handed on, so the newest row need not be solved
+            s = np.full(model.nx + model.ny, np.nan)
+            solved = Solved(np.vstack([est.info["x0"], est.x]), np.zeros(0), s, est.status, 0, {})
+        return solved
 
 
 def _density(method: Posterior, before: Answer, model: Linear, part: Record) -> tuple[float, bool]:
