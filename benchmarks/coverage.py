@@ -3,7 +3,7 @@
     python benchmarks/coverage.py [LOGS OR FOLDER ...] [--simulated 8] [--lengths 5,10,20,30,60] [--gaps 40] [--seed 1]
                                   [--method tube]
 
-Fixes are removed at random places before `fill` sees the log, several gaps at a time if they are far apart; the log is
+Fixes are removed at evenly spread places from a random first one on before `fill` sees the log, several gaps at a time if they are far apart; the log is
 then filled as a user would, with its own choice of method and its own test of the half-widths on what is left. The
 removed fixes, east and north counted apart, are inside or not. Gaps drawn at random overlap each other, so the standard
 error beside the share weighs each pair of gaps by how much of them is the same stretch of the log (Bartlett's kernel);
@@ -30,15 +30,18 @@ APART = 60.0
 
 
 def places(log, length, rng):
-    """Draw the beginnings of gaps that one run removes: moving, with fixes on both sides, far from each other."""
+    """Draw the beginnings of gaps that one run removes: moving, with fixes on both sides, far from each other.
+
+    They are evenly spread from a random first one on, so that every place of the log is as likely as any other: gaps
+    drawn one by one, each far from those before, crowd at the ends.
+    """
     t = log.t[log.fixed]
     east, north = Frame.of(log).to_local(log.lat_deg[log.fixed], log.lon_deg[log.fixed])
     usual = np.median(np.diff(t))
+    period = length + max(APART, length)
     chosen = []
-    for begin in rng.uniform(t[0] + MARGIN, t[-1] - MARGIN - length, 400):
+    for begin in np.arange(t[0] + MARGIN + rng.uniform(0, period), t[-1] - MARGIN - length, period):
         a, b = np.searchsorted(t, [begin, begin + length])
-        if any(abs(begin - other) < length + max(APART, length) for other in chosen):
-            continue
         whole = b - a >= 0.8 * length / usual - 1
         # moved further than the fixes scatter
         inside = np.column_stack((east[a:b], north[a:b]))[:: max(1, round(1.0 / usual))]
@@ -112,16 +115,17 @@ def on_log(log, lengths, wanted, seed, **how):
     every = []
     for length in lengths:
         rng = np.random.default_rng([seed, round(1000 * length)])
-        gaps, seconds = [], []
-        for _ in range(wanted):
+        gaps, seconds, empty = [], [], 0
+        while len(gaps) < wanted:
             begins = places(log, length, rng)
             if not begins:
-                break
+                empty += 1
+                if empty == 20:
+                    break
+                continue
             clock = time.process_time()
             gaps += one_run(log, begins, length, **how)
             seconds.append(time.process_time() - clock)
-            if len(gaps) >= wanted:
-                break
         if gaps:
             row(length, gaps, np.ptp(log.t[log.fixed]) / length, np.median(seconds), False)
             every += gaps
@@ -158,7 +162,7 @@ def on_drives(count, lengths, wanted, seed, **how):
         gaps, seconds, room = [], [], 0.0
         for k, (truth, log) in enumerate(made):
             rng = np.random.default_rng([seed, k, round(1000 * length)])
-            begins = places(log, length, rng)[: max(1, round(wanted / count))]
+            begins = rng.permutation(places(log, length, rng))[: max(1, round(wanted / count))].tolist()
             clock = time.process_time()
             gaps += one_run(log, begins, length, truth, k, **how) if begins else []
             seconds.append(time.process_time() - clock)
