@@ -9,8 +9,8 @@ import pytest
 import halfwidth as hw
 from halfwidth.vehicle import antennas, models
 from halfwidth.vehicle.antennas import TwoAntennas, limits_of, parsed_limits
-from halfwidth.vehicle.estimators import with_limits
 from halfwidth.vehicle.drive import simulate_drive
+from halfwidth.vehicle.estimators import with_limits
 from halfwidth.vehicle.fill import fill
 from halfwidth.vehicle.grid import sampled
 from halfwidth.vehicle.roads import Roads
