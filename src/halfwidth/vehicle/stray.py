@@ -6,7 +6,9 @@ to doubt (the first seconds after a gap, the last ones before it, and what follo
 the doubtful fixes are hidden, and the chain, with the noise that the drive was found to have, says where they should
 have been: after a gap from the fixes after them alone, before it from those before them, so that a gap badly bridged
 proves nothing. What is further off than that can be wrong goes, up to the first fix that agrees again. If none agrees
-the fixes are believed: then the reckoning is wrong, or they are all that is known.
+the fixes are believed: then the reckoning is wrong, or they are all that is known. They are believed, too, if the other
+side of the gap, alone, comes nearer to them than to the fixes that follow: then the receiver's own slow error jumped
+when they ended (a correction arrived), and without them the path would be bent all the way through the gap.
 """
 
 from collections.abc import Sequence
@@ -51,8 +53,12 @@ _CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 1.6, 2.
 #: Scale of what the calibration takes to be without noise.
 _NO_NOISE = 1e-4
 
-#: Share of that distance that must be left when both sides of a gap are asked.
-_BOTH = 0.5
+#: Fixes that follow wrong ones for so long, away from the gap, are what the other side of the gap, so much of it, is
+#: compared with, s.
+_FOLLOW, _FAR_SIDE = 8.0, 80.0
+
+#: Size from which on fixes next to a gap are sooner wrong than apart by a jump of the receiver's slow error, m.
+_SOONER = 2.0
 
 #: Scale and bias are known to this many of their standard deviations, and no better than this.
 _KNOWN, _SCALE, _BIAS = 3.0, 0.003, 0.001
@@ -150,6 +156,7 @@ class _Doubt:
     block: tuple[int, int]  # fixes without a gap among them
     before: bool  # whether the fixes before them are asked where they should have been
     after: bool  # and those after them
+    size: float = 0.0  # how far off the wrong ones among them were so far, m
 
     @property
     def backwards(self) -> bool:
@@ -172,7 +179,6 @@ class _Wrong:
     """Fixes that are wrong by what was said about one doubt."""
 
     clear: float  # how many standard deviations the furthest is off
-    doubted: NDArray[np.intp]
     nodes: NDArray[np.intp]
     distance: Floats
 
@@ -184,7 +190,7 @@ class _Search:
         self.grid, self.seen, self.settings, self.noise = grid, seen, settings, noise
         self.size = np.zeros(len(grid))
         self.gone = np.zeros(len(grid), dtype=bool)
-        self._usual: dict[tuple[bool, bool, float], float] = {}
+        self._asked: dict[tuple[bool, bool, float], Floats] = {}
 
     def look(self, doubts: Sequence[_Doubt], share: float = 1.0) -> list[_Doubt]:
         """Find which of the doubtful fixes are wrong; return the doubts that had some, moved on to the next fix.
@@ -196,19 +202,21 @@ class _Search:
             doubt, nodes = answer.doubt, answer.nodes
             if not _wrong(answer, share).any():
                 continue
-            wrong = _wrong(answer, share * self._unusual(doubt, answer.length)) & ~self.gone[nodes]
+            usual = self._usual(doubt, answer.length)
+            wrong = _wrong(answer, share * _unusual(usual)) & ~self.gone[nodes]
             if wrong.any():
                 distance, sd = answer.off[-1]
                 clear = float((distance / sd)[wrong].max())
                 if doubt not in clearest or clear > clearest[doubt].clear:
-                    clearest[doubt] = _Wrong(clear, nodes, nodes[wrong], distance[wrong])
+                    clearest[doubt] = _Wrong(clear, nodes[wrong], distance[wrong])
         left = []
         for doubt, stray in self._confirmed(clearest).items():
             self.size[stray.nodes], self.gone[stray.nodes] = stray.distance, True
             rest = np.flatnonzero(~self.gone[self.seen[doubt.block[0] : doubt.block[1]]]) + doubt.block[0]
             rest = rest[rest <= doubt.first] if doubt.backwards else rest[rest >= doubt.first]
             if rest.size:
-                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0])))
+                size = max(doubt.size, float(stray.distance.max()))
+                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0]), size=size))
         return left
 
     def _ask(self, doubts: Sequence[_Doubt], lengths: Sequence[float]) -> list[_Answer]:
@@ -241,34 +249,52 @@ class _Search:
         ]
 
     def _confirmed(self, found: dict[_Doubt, "_Wrong"]) -> dict[_Doubt, "_Wrong"]:
-        """Ask the other side of the gap, too: what it puts right is not wrong."""
-        t, end = self.grid.t[self.seen], self.seen.size
-        hidden, parts = [], []
+        """Ask the other side of the gap alone whether it comes nearer to the doubtful fixes or to those that follow.
+
+        If to the doubtful ones, what lies between the two is a jump of the receiver's own slow error. Both are off by
+        what reckoning through the gap is, so the two distances share one deviation. Where it is too large to tell the
+        size speaks: as likely a fault as a jump at `_SOONER`, in proportion to it beyond.
+        """
+        t = self.grid.t[self.seen]
+        asked: list[tuple[_Doubt, slice, tuple[NDArray[np.intp], NDArray[np.intp]]]] = []
+        hidden = []
         for doubt, wrong in found.items():
+            first, stop = doubt.block
+            at = np.searchsorted(self.seen, wrong.nodes)
             mask = self.gone.copy()
-            mask[wrong.doubted] = True
-            here = t[doubt.first]
-            back, ahead = (AROUND, AROUND + DOUBTED[-1]) if doubt.after else (AROUND + DOUBTED[-1], AROUND)
-            start = np.searchsorted(t, min(here, t[max(doubt.block[0] - 1, 0)]) - back)
-            stop = np.searchsorted(t, max(here, t[min(doubt.block[1], end - 1)] if not doubt.after else here) + ahead)
-            parts.append(slice(int(self.seen[start]), int(self.seen[min(int(stop), end - 1)]) + 1))
-            hidden.append(self.grid.rows(parts[-1]).masked(mask[parts[-1]]))
+            if doubt.backwards:
+                begin = max(first, int(np.searchsorted(t, t[at[0]] - _FOLLOW)))
+                end = int(np.searchsorted(t, t[min(stop, t.size - 1)] + _FAR_SIDE))
+                following = self.seen[begin : at[0]]
+                mask[self.seen[:stop]] = True
+            else:
+                begin = int(np.searchsorted(t, t[max(first - 1, 0)] - _FAR_SIDE))
+                end = min(stop, int(np.searchsorted(t, t[at[-1]] + _FOLLOW)))
+                following = self.seen[at[-1] + 1 : end]
+                mask[self.seen[first:]] = True
+            following = following[~self.gone[following]]
+            part = slice(int(self.seen[begin]), int(self.seen[end - 1]) + 1)
+            # a jump in the middle of fixes was put to both sides before
+            if doubt.before != doubt.after and following.size and np.any(self.grid.seen[part] & ~mask[part]):
+                asked.append((doubt, part, (wrong.nodes, following)))
+                hidden.append(self.grid.rows(part).masked(mask[part]))
         fits = chain.solve(hidden, self.settings, sigma=self.noise, learn=False) if hidden else []
-        kept = {}
-        for (doubt, wrong), part, fit in zip(found.items(), parts, fits, strict=True):
-            both, _ = _off(self.grid, wrong.nodes, part, fit)
-            if float(np.median(both)) > _BOTH * float(np.median(wrong.distance)):
-                kept[doubt] = wrong
-        return kept
+        better = dict(found)
+        for (doubt, part, sides), fit in zip(asked, fits, strict=True):
+            (doubtful, sd), (following, _) = (np.median(_off(self.grid, nodes, part, fit), axis=1) for nodes in sides)
+            nearer = 0.5 * float(doubtful**2 - following**2) / float(sd) ** 2
+            size = max(float(found[doubt].distance.max()), doubt.size)
+            if nearer + np.log(size / _SOONER) < 0:
+                del better[doubt]
+        return better
 
-    def _unusual(self, doubt: _Doubt, length: float) -> float:
-        """Return how many times further off than `FAR` fixes must be that are doubted like this.
+    def _usual(self, doubt: _Doubt, length: float) -> Floats:
+        """Return how many standard deviations fixes are off at most that nobody doubts, at places all along the drive.
 
-        The chain's own deviations are too small on a log whose errors are not as it takes them. How far fixes are off
-        that nobody doubts, all along the drive, says by how much.
+        The chain's own deviations are too small on a log whose errors are not as it takes them; these say by how much.
         """
         kind = doubt.before, doubt.after, length
-        if kind not in self._usual:
+        if kind not in self._asked:
             room = length + AROUND / 2
             t = self.grid.t[self.seen]
             controls = []
@@ -284,12 +310,19 @@ class _Search:
                     for k in firsts
                     if not self.gone[self.seen[k]]
                 ]
-            answers = self._ask(controls, (length,))
-            most = [float(np.min([distance / sd for distance, sd in one.off], axis=0).max()) for one in answers]
-            enough = len(most) >= _FEWEST_CONTROLS
-            usual = float(np.quantile(most, _QUANTILE)) if enough else _UNKNOWN * FAR
-            self._usual[kind] = max(1.0, _MARGIN * usual / FAR if enough else _UNKNOWN)
-        return self._usual[kind]
+            self._asked[kind] = np.array([_most(one) for one in self._ask(controls, (length,))])
+        return self._asked[kind]
+
+
+def _most(answer: _Answer) -> float:
+    """Return how many standard deviations the furthest of the fixes is off, by the side that says the least."""
+    return float(np.min([distance / sd for distance, sd in answer.off], axis=0).max())
+
+
+def _unusual(usual: Floats) -> float:
+    """Return how many times further off than `FAR` fixes must be, from how far off others are."""
+    enough = usual.size >= _FEWEST_CONTROLS
+    return max(1.0, _MARGIN * float(np.quantile(usual, _QUANTILE)) / FAR if enough else _UNKNOWN)
 
 
 def _off(grid: Grid, nodes: NDArray[np.intp], part: slice, fit: chain.Fit) -> tuple[Floats, Floats]:
