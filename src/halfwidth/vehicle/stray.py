@@ -6,9 +6,9 @@ to doubt (the first seconds after a gap, the last ones before it, and what follo
 the doubtful fixes are hidden, and the chain, with the noise that the drive was found to have, says where they should
 have been: after a gap from the fixes after them alone, before it from those before them, so that a gap badly bridged
 proves nothing. What is further off than that can be wrong goes, up to the first fix that agrees again. If none agrees
-the fixes are believed: then the reckoning is wrong, or they are all that is known. They are believed, too, if the other
-side of the gap, alone, comes nearer to them than to the fixes that follow: then the receiver's own slow error jumped
-when they ended (a correction arrived), and without them the path would be bent all the way through the gap.
+the fixes are believed: then the reckoning is wrong, or they are all that is known. They are believed, too, if a jump of
+the receiver's own slow error explains the drive as well (a correction arrives, a satellite is lost): without them the
+path would be bent all the way through the gap.
 """
 
 from collections.abc import Sequence
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from halfwidth.vehicle import chain
 from halfwidth.vehicle.grid import Grid
+from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pointing import azimuth_of
 from halfwidth.vehicle.sensors import Calibration
 
@@ -53,12 +54,9 @@ _CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 1.6, 2.
 #: Scale of what the calibration takes to be without noise.
 _NO_NOISE = 1e-4
 
-#: Fixes that follow wrong ones for so long, away from the gap, are what the other side of the gap, so much of it, is
-#: compared with, s.
-_FOLLOW, _FAR_SIDE = 8.0, 80.0
-
-#: Size from which on fixes next to a gap are sooner wrong than apart by a jump of the receiver's slow error, m.
-_SOONER = 2.0
+#: How much of the drive on each side of a gap tells wrong fixes from a jump, s; the chain that is asked; how far wrong
+#: fixes may be off, m; and with how many numbers an axis.
+_SIDE, _JUDGE, _WIDE, _SHAPE = 60.0, chain.Chain(rounds=16), 10.0, 3
 
 #: Scale and bias are known to this many of their standard deviations, and no better than this.
 _KNOWN, _SCALE, _BIAS = 3.0, 0.003, 0.001
@@ -156,7 +154,7 @@ class _Doubt:
     block: tuple[int, int]  # fixes without a gap among them
     before: bool  # whether the fixes before them are asked where they should have been
     after: bool  # and those after them
-    size: float = 0.0  # how far off the wrong ones among them were so far, m
+    known: bool = False  # whether others beside them are known to be wrong
 
     @property
     def backwards(self) -> bool:
@@ -215,8 +213,7 @@ class _Search:
             rest = np.flatnonzero(~self.gone[self.seen[doubt.block[0] : doubt.block[1]]]) + doubt.block[0]
             rest = rest[rest <= doubt.first] if doubt.backwards else rest[rest >= doubt.first]
             if rest.size:
-                size = max(doubt.size, float(stray.distance.max()))
-                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0]), size=size))
+                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0]), known=True))
         return left
 
     def _ask(self, doubts: Sequence[_Doubt], lengths: Sequence[float]) -> list[_Answer]:
@@ -249,44 +246,39 @@ class _Search:
         ]
 
     def _confirmed(self, found: dict[_Doubt, "_Wrong"]) -> dict[_Doubt, "_Wrong"]:
-        """Ask the other side of the gap alone whether it comes nearer to the doubtful fixes or to those that follow.
+        """Keep the doubts in which wrong fixes explain the drive better than a jump of the receiver's slow error.
 
-        If to the doubtful ones, what lies between the two is a jump of the receiver's own slow error. Both are off by
-        what reckoning through the gap is, so the two distances share one deviation. Where it is too large to tell the
-        size speaks: as likely a fault as a jump at `_SOONER`, in proportion to it beyond.
+        The chain that knows such jumps learns from the drive around the gap as it is, and from the same with the
+        doubtful fixes put back by as much as they are off: by a constant, a trend and a bend, as far as they are
+        enough. The likelihood must grow by more than what these numbers are worth: each the logarithm of how little of
+        `_WIDE` is left for it. Next to fixes that are wrong it need only grow. In the middle of fixes both sides were
+        asked before.
         """
-        t = self.grid.t[self.seen]
-        asked: list[tuple[_Doubt, slice, tuple[NDArray[np.intp], NDArray[np.intp]]]] = []
-        hidden = []
-        for doubt, wrong in found.items():
-            first, stop = doubt.block
-            at = np.searchsorted(self.seen, wrong.nodes)
-            mask = self.gone.copy()
-            if doubt.backwards:
-                begin = max(first, int(np.searchsorted(t, t[at[0]] - _FOLLOW)))
-                end = int(np.searchsorted(t, t[min(stop, t.size - 1)] + _FAR_SIDE))
-                following = self.seen[begin : at[0]]
-                mask[self.seen[:stop]] = True
-            else:
-                begin = int(np.searchsorted(t, t[max(first - 1, 0)] - _FAR_SIDE))
-                end = min(stop, int(np.searchsorted(t, t[at[-1]] + _FOLLOW)))
-                following = self.seen[at[-1] + 1 : end]
-                mask[self.seen[first:]] = True
-            following = following[~self.gone[following]]
-            part = slice(int(self.seen[begin]), int(self.seen[end - 1]) + 1)
-            # a jump in the middle of fixes was put to both sides before
-            if doubt.before != doubt.after and following.size and np.any(self.grid.seen[part] & ~mask[part]):
-                asked.append((doubt, part, (wrong.nodes, following)))
-                hidden.append(self.grid.rows(part).masked(mask[part]))
-        fits = chain.solve(hidden, self.settings, sigma=self.noise, learn=False) if hidden else []
+        asked = [doubt for doubt in found if doubt.before != doubt.after]
+        parts = [self._around(doubt, found[doubt].nodes) for doubt in asked]
+        here = [self.grid.rows(part).masked(self.gone[part]) for part in parts]
+        own = [found[doubt].nodes - part.start for doubt, part in zip(asked, parts, strict=True)]
+        hidden = [drive.masked(np.isin(np.arange(len(drive)), k)) for drive, k in zip(here, own, strict=True)]
+        without = chain.solve(hidden, _JUDGE) if asked else []
+        moved = [_put_back(drive, k, fit.path) for drive, k, fit in zip(here, own, without, strict=True)]
+        fits = chain.solve([*here, *moved], _JUDGE) if asked else []
+        gain = [_likely(fit, drive) for fit, drive in zip(fits, [*here, *moved], strict=True)]
         better = dict(found)
-        for (doubt, part, sides), fit in zip(asked, fits, strict=True):
-            (doubtful, sd), (following, _) = (np.median(_off(self.grid, nodes, part, fit), axis=1) for nodes in sides)
-            nearer = 0.5 * float(doubtful**2 - following**2) / float(sd) ** 2
-            size = max(float(found[doubt].distance.max()), doubt.size)
-            if nearer + np.log(size / _SOONER) < 0:
+        for i, (doubt, k, fit) in enumerate(zip(asked, own, without, strict=True)):
+            numbers = 0 if doubt.known else 2 * min(k.size, _SHAPE)
+            spread = fit.path.variance
+            left = np.nan if spread is None else float(np.sqrt(np.median(spread[k])))
+            if gain[len(asked) + i] - gain[i] < numbers * max(np.log(_WIDE / left), 0.0):
                 del better[doubt]
         return better
+
+    def _around(self, doubt: _Doubt, nodes: NDArray[np.intp]) -> slice:
+        """Return the nodes around a gap with doubtful fixes at one of its ends."""
+        t, at = self.grid.t[self.seen], np.searchsorted(self.seen, nodes)
+        first, last = (doubt.block[0] - 1, at[-1] + 1) if doubt.after else (at[0] - 1, doubt.block[1])
+        begin = int(np.searchsorted(t, t[max(int(first), 0)] - _SIDE))
+        end = int(np.searchsorted(t, t[min(int(last), t.size - 1)] + _SIDE))
+        return slice(int(self.seen[begin]), int(self.seen[end - 1]) + 1)
 
     def _usual(self, doubt: _Doubt, length: float) -> Floats:
         """Return how many standard deviations fixes are off at most that nobody doubts, at places all along the drive.
@@ -312,6 +304,29 @@ class _Search:
                 ]
             self._asked[kind] = np.array([_most(one) for one in self._ask(controls, (length,))])
         return self._asked[kind]
+
+
+def _put_back(drive: Grid, own: NDArray[np.intp], path: Path) -> Grid:
+    """Return a drive with the fixes of some nodes moved by the smooth part of what they are off a path."""
+    t = drive.t[own] - drive.t[own].mean()
+    shape = np.vander(t / max(float(np.ptp(t)), 1e-9), min(own.size, _SHAPE))
+    off = np.column_stack((drive.east - path.east, drive.north - path.north))[own]
+    if not np.isfinite(off).all():
+        return drive
+    smooth = shape @ np.linalg.lstsq(shape, off, rcond=None)[0]
+    east, north = drive.east.copy(), drive.north.copy()
+    east[own], north[own] = east[own] - smooth[:, 0], north[own] - smooth[:, 1]
+    return replace(drive, east=east, north=north)
+
+
+def _likely(fit: chain.Fit, drive: Grid) -> float:
+    """Return the log-likelihood of the fixes of a drive, with Student's distribution of the increments of the offset.
+
+    To that given their weights w comes what the weights cost, (tail / 2) (log w - w + 1) each: with the best weight
+    it is the logarithm of Student's density, but for a constant.
+    """
+    weight = fit.weight[1:][~chain.in_gap(drive)[1:]]
+    return fit.loglik + 0.5 * _JUDGE.tail * float(np.sum(np.log(weight) - weight + 1.0))
 
 
 def _most(answer: _Answer) -> float:
