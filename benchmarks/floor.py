@@ -11,6 +11,9 @@ guess. So
     told   is the same with a hint that nobody has: how far the error of the fixes moves from each hidden fix to the
            next, though not in which direction.
 
+It is no strict bound: how the fixes' error moves at the edges of the gap is known as well, and a method that uses that
+may come out a little below.
+
 A jump is a step of the fixes' error of more than ten times the usual one (the median of the log): the last columns leave
 out the outages with one. The path of the chain bends a little towards the fixes that it is given, which makes the floor
 too low, and what is wrong with the sensors and looks like an error of the fixes makes it too high: so beside it stands
@@ -147,6 +150,8 @@ def main():
         fixes = Fixes(log)
         found = hw.vehicle.outages(log, tuple(rows), asked.starts, asked.seed, ("em",))
         print(f"\n=== {path.name}: {asked.starts} starts, seed {asked.seed}")
+        step = _steps(fixes.error)[1:]
+        print(f"error of the fixes, from one to the next: usually {np.median(step):.3f} m, at most {step.max():.2f} m")
         floors(fixes, found, rows)
         if asked.draws:
             drawn(log, fixes, rows, asked.draws)
