@@ -246,7 +246,7 @@ def test_a_logger_that_hangs_and_other_faults_are_survived_together(drive, clean
 
 @pytest.mark.parametrize("seed", [3, 8])
 def test_a_speed_that_is_stuck_below_a_cars_reach_is_named(seed):
-    truth, log = simulate_drive(seed=seed, **DRIVE)
+    _, log = simulate_drive(seed=seed, **DRIVE)
     rows = np.flatnonzero((log.t > 101.0) & (log.t < 112.0))
     stuck = log.speed_mps.copy()
     # as fast as one second after the end, and 1.8 m/s more: a car of 12 m/s2 could do that in two samples
