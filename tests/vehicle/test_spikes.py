@@ -64,7 +64,7 @@ def test_a_sensor_is_stuck_for_longer_than_it_ever_holds_a_value(rate):
     assert found.size >= 0.9 * n
 
 
-def test_a_speed_that_is_stuck_until_the_car_stands_is_found_and_so_is_one_stuck_at_zero():
+def test_a_speed_that_is_stuck_until_the_car_stands_is_found_and_a_halt_at_once_is_not():
     _, log = simulate_drive(duration=300, seed=3, tunnels=())
     speed = log.speed_mps
     stands = np.flatnonzero((speed[1:] == 0) & (speed[:-1] > 0)) + 1
@@ -73,9 +73,7 @@ def test_a_speed_that_is_stuck_until_the_car_stands_is_found_and_so_is_one_stuck
     (found,) = spikes(with_samples(log, "speed_mps", slice(fast, end), speed[fast])).stuck["speed_mps"]
     assert found[-1] == end - 1
     moving = np.flatnonzero((speed[:-60] > 8) & (speed[60:] > 8))
-    rows = np.arange(moving[0], moving[0] + 60)
-    (found,) = spikes(with_samples(log, "speed_mps", rows, 0.0)).stuck["speed_mps"]
-    np.testing.assert_array_equal(found, rows)
+    assert len(spikes(with_samples(log, "speed_mps", slice(moving[0], moving[0] + 60), 0.0))) == 0
 
 
 @pytest.mark.parametrize("seed", range(20, 24))

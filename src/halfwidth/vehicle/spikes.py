@@ -6,7 +6,8 @@ test of fixes names it. One or two samples are a spike if they are further from 
 can change in that time, and than ten times what is usual. Equal samples for a second or more are stuck if the value
 before or after them leaps: out of a car's reach, or by three times what all but a hundredth of the log's changes are,
 or, where the samples stay equal for three times as long as anywhere else, by more than the log's usual change. A car
-that cruises ends that smoothly. Of leaps to and from 0 what a sensor may be blind for does not count.
+that cruises ends that smoothly. A speed of 0 is never stuck, as a car stands for as long as it likes, and of a leap to
+or from 0 what a sensor may be blind for does not count.
 """
 
 from collections.abc import Mapping
@@ -127,19 +128,16 @@ def spikes(log: Log) -> Spikes:
         held = t[end] - t[begin]
         long = (end - begin + 1 >= _STUCK) & (held >= _STUCK_S)
         change = np.abs(np.diff(values))
-        # a car may stand for as long as it likes, and a coarse log may stop it at once
         still = (values[1:] == 0) | (values[:-1] == 0)
         leap = np.where(still, np.maximum(change - _BLIND[name], 0.0), change)
         leap = np.concatenate(([0.0], leap, [0.0]))
-        # whatever stood still before a car stands: the sensor was stuck before, not while it stands
-        first, last = leap[begin], leap[end + 1]
-        leap = np.where(values[begin] == 0, np.minimum(first, last), np.maximum(first, last))
+        leap = np.where(values[begin] == 0, 0.0, np.maximum(leap[begin], leap[end + 1]))
         reach = at_once + rate * float(np.median(np.diff(t)))
         changes = change[change > 0]
         if changes.size >= _CHANGES:
             reach = min(reach, _OFTEN * float(np.quantile(changes, 0.99)))
             other = np.partition(held[values[begin] != 0], -2)[-2] if np.sum(values[begin] != 0) > 1 else np.inf
-            alone = (values[begin] != 0) & (held > _LONGER * max(other, _STUCK_S))
+            alone = held > _LONGER * max(other, _STUCK_S)
             odd = long & ((leap > reach) | (alone & (leap > _MORE * float(np.median(changes)))))
         else:
             odd = long & (leap > reach)
