@@ -21,7 +21,6 @@
 namespace hw {
 namespace HW_ISA {
 
-constexpr int ep_free = 16;   // most free parameters
 constexpr int ep_alone = 10;  // sweeps of a chain with its bounds alone, which starts afresh
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
@@ -459,7 +458,7 @@ struct EpLearner {
                 keep_tau[k] = b.tau[k];
                 keep_nu[k] = b.nu[k];
             }
-            for (int j = 0; j < q; j++) from[j] = group[j] >= 0 ? std::log(max2(a.was[group[j]], 1e-300)) : phi[j];
+            for (int j = 0; j < q; j++) from[j] = group[j] >= 0 ? std::log(max2(a.start[group[j]], 1e-300)) : phi[j];
             keep(from);
         }
         const EpCross wanted = ep.cross;
@@ -530,7 +529,7 @@ struct EpLearner {
             }
             recall(at);
             evaluate_inside(at, a.most, a.tol_nodes, value, slope, false);
-            ep.shapes(b.k3, b.k4);
+            ep.shapes(b.k3, b.k4, a.shaped);
             for (int l = 0; l < wide_lanes && k + l < nodes; l++) {
                 for (int j = 0; j < q; j++) {
                     a.phi[(k + l) * q + j] = at[l][j];
