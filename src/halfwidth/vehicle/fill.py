@@ -580,8 +580,8 @@ def _end_tests(
 def _nearest(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, length: float) -> str:
     """Return which way came nearest to hidden fixes, and was surest, in stretches about as long as this.
 
-    Another way than the usual one has to be clearly better. Where the sensors speak, it has to be so in the stretches of
-    all lengths together, too: what fixes are wrong by is the same in all of them, and a few long ones are soon luck.
+    Another way than the usual one has to be clearly better. Where the sensors speak, it has to be so in the stretches
+    of all lengths together, too: what fixes are wrong by is the same in all, and a few long ones are soon luck.
     """
     size = {name: {one.length_s: one.mean_m * one.half_m for one in row} for name, row in tests.items()}
     if usual not in size:

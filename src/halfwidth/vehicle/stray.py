@@ -55,8 +55,8 @@ _CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 1.6, 2.
 _NO_NOISE = 1e-4
 
 #: How much of the drive on each side of a gap tells wrong fixes from a jump, s; the chain that is asked; how far wrong
-#: fixes may be off, m; and with how many numbers an axis.
-_SIDE, _JUDGE, _WIDE, _SHAPE = 60.0, chain.Chain(rounds=16), 10.0, 3
+#: fixes may be off, m, and with how many numbers an axis; the logarithm of the odds against them: one gap in ten.
+_SIDE, _JUDGE, _WIDE, _SHAPE, _RARE = 60.0, chain.Chain(rounds=16), 10.0, 3, 2.2
 
 #: Scale and bias are known to this many of their standard deviations, and no better than this.
 _KNOWN, _SCALE, _BIAS = 3.0, 0.003, 0.001
@@ -251,7 +251,7 @@ class _Search:
         The chain that knows such jumps learns from the drive around the gap as it is, and from the same with the
         doubtful fixes put back by as much as they are off: by a constant, a trend and a bend, as far as they are
         enough. The likelihood must grow by more than what these numbers are worth: each the logarithm of how little of
-        `_WIDE` is left for it. Next to fixes that are wrong it need only grow. In the middle of fixes both sides were
+        `_WIDE` is left for it, and for how rare wrong fixes are. Next to some that are wrong it need only grow. In the middle of fixes both sides were
         asked before.
         """
         asked = [doubt for doubt in found if doubt.before != doubt.after]
@@ -265,10 +265,10 @@ class _Search:
         gain = [_likely(fit, drive) for fit, drive in zip(fits, [*here, *moved], strict=True)]
         better = dict(found)
         for i, (doubt, k, fit) in enumerate(zip(asked, own, without, strict=True)):
-            numbers = 0 if doubt.known else 2 * min(k.size, _SHAPE)
             spread = fit.path.variance
             left = np.nan if spread is None else float(np.sqrt(np.median(spread[k])))
-            if gain[len(asked) + i] - gain[i] < numbers * max(np.log(_WIDE / left), 0.0):
+            worth = _RARE + 2 * min(k.size, _SHAPE) * max(np.log(_WIDE / left), 0.0)
+            if gain[len(asked) + i] - gain[i] < (0.0 if doubt.known else worth):
                 del better[doubt]
         return better
 
