@@ -318,7 +318,7 @@ def _added(model: Linear, record: Record) -> Array:
     if model.B is not None and record.u is not None:
         b = np.einsum("tij,tj->ti", _every(model.B, record, dt), record.u)
     if model.E is not None:
-        b = np.linalg.solve(_every(model.E, record, dt), b[:, :, None])[:, :, 0]
+        b = np.asarray(np.linalg.solve(_every(model.E, record, dt), b[:, :, None])[:, :, 0])
     return np.ascontiguousarray(b)
 
 

@@ -287,8 +287,9 @@ class Posterior:
             _core.ep_learn(
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
                 chain.fitted, learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z,
-                log_proposal, limits, None if start is None else start.before, drop, shaped, None if known is None else known.pull,
-                None if known is None else known.precision, chain.outside if limits["condition"] > 0 else None,
+                log_proposal, limits, None if start is None else start.before, drop, shaped,
+                None if known is None else known.pull, None if known is None else known.precision,
+                chain.outside if limits["condition"] > 0 else None,
             )
         )  # fmt: skip
 
