@@ -343,9 +343,7 @@ struct EpLearner {
             for (int l = 0; l < wide_lanes; l++) put(l, at[l]);
             if (k > 0 || warm) recall(at);
             else ep.start();
-            // a start that is refused may only want more sweeps, as where caps leave little room
-            const int most = k > 0 || warm ? a.few : a.many << refused;
-            evaluate_inside(at, most, a.tol, value, slope, *best == minus_inf);
+            evaluate_inside(at, k > 0 || warm ? a.few : a.many, a.tol, value, slope, *best == minus_inf);
             if (!(value[0] > *best - 0.05 * q) && refused < 6) {  // too far, or no trajectory fits
                 refused++;
                 if (*best == minus_inf) {  // the start itself: wider half-widths fit more

@@ -33,7 +33,14 @@ def main():
     step = 1.0
     rounded = hw.Record(record.t, np.round(record.y / step) * step)
     mixed = hw.Linear(A, None, C, unknown, hw.Uniform(step / 2) + unknown, x0)
-    print("\nrounded to", step, "- R =", hw.estimate(mixed, rounded).R.round(2), "beside the rounding; without it", end=" ")
+    print(
+        "\nrounded to",
+        step,
+        "- R =",
+        hw.estimate(mixed, rounded).R.round(2),
+        "beside the rounding; without it",
+        end=" ",
+    )
     print(hw.estimate(hw.Linear(A, None, C, unknown, unknown, x0), rounded).R.round(2))
 
     # On line, variances are carried from window to window as half-widths are.
