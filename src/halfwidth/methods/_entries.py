@@ -102,12 +102,11 @@ class _Search:
         if math.isinf(self.at(theta)):
             # Nothing fits there, as where an unknown output gain is 0: look elsewhere between the bounds.
             width = np.where(np.isfinite(self.hi - self.lo), self.hi - self.lo, 2.0)
-            for share in np.random.default_rng(20260).uniform(-0.45, 0.45, (_ELSEWHERE, len(theta))):
-                theta = self.first + share * width
-                if not math.isinf(self.at(theta)):
-                    break
-            else:
-                return self.first, False
+            points = np.random.default_rng(20260).uniform(-0.45, 0.45, (_ELSEWHERE, len(theta))) * width + theta
+            values = [self.at(point) for point in points]
+            if math.isinf(max(values)):
+                return theta, False
+            theta = points[int(np.argmax(values))]
         span = np.where(np.isfinite(self.hi - self.lo), self.hi - self.lo, 1.0)
         size = 1e-3 * span
 

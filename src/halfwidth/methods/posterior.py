@@ -297,8 +297,8 @@ class Posterior:
         return found
 
     def _learn(
-        self, chain: Sites, model: Linear, first: Array, start: Start | None, drop: int, known: Known | None, shaped: int,
-        limits: dict[str, Any], count: int,
+        self, chain: Sites, model: Linear, first: Array, start: Start | None, drop: int, known: Known | None,
+        shaped: int, limits: dict[str, Any], count: int,
     ) -> dict[str, Any]:  # fmt: skip
         rate, learn_rate, beta = self._rate(model)
         z, log_proposal = nodes(int(chain.free.sum()) + learn_rate, count)
