@@ -222,6 +222,17 @@ def groups(model: Model) -> int:
     return once if all(part is None or part.known for part in map(gaussian_part, (model.w, model.e))) else 2 * once
 
 
+def unknowns(model: Model) -> int:
+    """Return how many half-widths and variances of a model are to be found."""
+    count = 0
+    for noise, n in ((model.w, model.nx), (model.e, model.ny)):
+        box, part = uniform_part(noise), gaussian_part(noise)
+        ends = [] if box is None else [np.array([np.broadcast_to(v, n) for v in (box.at_least, box.at_most)])]
+        for lo, hi in [*ends, _ends(part, n)]:
+            count += int(np.count_nonzero(lo < hi))
+    return count
+
+
 def _groups(model: Linear) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """Return floors and caps of all groups, which are half-widths and which unknown deviations; each (p,)."""
     floor, cap, uniform = _half_widths(model)

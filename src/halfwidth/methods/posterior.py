@@ -35,7 +35,7 @@ from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
 from halfwidth.methods._carry import WARP, Carried, Known, Start
 from halfwidth.methods._protocol import typed
-from halfwidth.methods._sites import Frame, Sites, gaussian_part, sites, uniform_part
+from halfwidth.methods._sites import Frame, Sites, gaussian_part, sites, uniform_part, unknowns
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
@@ -70,6 +70,7 @@ _FEW = 3.0
 #: Beta prior of a contamination rate that is learned.
 _RATE = (1.0, 30.0)
 _MOST_STATES = 16
+_MOST_UNKNOWN = 16
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,12 @@ class Posterior:
             return (f"cannot draw: {why}", hint) if reason else (None, "")
         if model.nx > _MOST_STATES:
             return f"takes at most {_MOST_STATES} states but the model has {model.nx}", "a smaller model"
+        unknown = unknowns(model) + (self.outliers is True or (model.loss is not None and not model.loss.known))
+        if unknown > _MOST_UNKNOWN:
+            return (
+                f"finds at most {_MOST_UNKNOWN} half-widths and variances but {unknown} are unknown",
+                "BatchLP(), or known ones such as Uniform.unknown(at_least=q, at_most=q)",
+            )
         if isinstance(model, Nonlinear) and model.loss is not None:
             return "takes no loss of a nonlinear model", "RBPF() or ParticleFilter()"
         if model.bounds is not None:
@@ -264,12 +271,11 @@ class Posterior:
     def _solve(
         self, chain: Sites, model: Linear, start: Start | None, drop: int, known: Known | None, shaped: int
     ) -> dict[str, Any]:
-        rate, learn_rate, beta = self._rate(model)
+        rate, learn_rate, _ = self._rate(model)
         first = np.where(chain.free, chain.guess, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
         if start is not None:
             first = np.where(chain.free, start.s.clip(chain.floor, chain.cap), first)
         q = int(chain.free.sum()) + learn_rate
-        z, log_proposal = nodes(q, self.nodes if q else 1)
         limits = dict(_LIMITS)
         limits["condition"] = max(0.0, 1.0 - _EVENT / max(len(chain.problem["start"]) - 2, 1))
         rows = max(float(chain.count.sum()), 1.0)
@@ -283,6 +289,19 @@ class Posterior:
             limits |= _MIXED
         if chain.exact:
             limits["most"] = 1
+        found = self._learn(chain, model, first, start, drop, known, shaped, limits, self.nodes if q else 1)
+        if int(found["code"]) == 2 and q and self.nodes > 1:
+            # A mode in the corner of its bounds may have no node inside them: then it stands alone.
+            found = self._learn(chain, model, first, start, drop, known, shaped, limits, 1)
+            found["code"] = max(int(found["code"]), 1)
+        return found
+
+    def _learn(
+        self, chain: Sites, model: Linear, first: Array, start: Start | None, drop: int, known: Known | None,
+        shaped: int, limits: dict[str, Any], count: int,
+    ) -> dict[str, Any]:  # fmt: skip
+        rate, learn_rate, beta = self._rate(model)
+        z, log_proposal = nodes(int(chain.free.sum()) + learn_rate, count)
         return dict(
             _core.ep_learn(
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
