@@ -41,6 +41,8 @@ inline V root(const V& a) { return V::of(sqrt4(a.v)); }
 inline V log_of(const V& a) { return V::of(log4(a.v)); }
 inline V either(decltype(X{} < X{}) test, const V& a, const V& b) { return V::of(test ? a.v : b.v); }
 
+constexpr int shape_reach = 4;
+
 // sizes of local arrays
 template <class N>
 constexpr int ep_cap = N::fixed ? N::cap : ep_states;
@@ -162,10 +164,13 @@ struct Ep {
     EpBlock block;
     EpState s;
     EpCross cross;
+    int shaped = 0;  // first stage whose shape is asked for
     // A bound farther off than the root of `reach` standard deviations, or one that narrows its cavity's variance by a
     // share below `faint`, says nothing at the precision that is asked for.
     double reach = 72.0, faint = 1e-13;
 
+    // whether a shape that is asked for needs the cumulants of stage t
+    inline bool bent(int t) const { return cross.S && t >= shaped - shape_reach; }
     inline int packed() const { return n * (n + 1) / 2; }
     inline void unpack(const V* p, V* M) const {
         for (int i = 0; i < n; i++)
@@ -220,23 +225,25 @@ struct Ep {
 
     void start() {
         for (int t = 0; t <= a.T; t++)
-            for (int i = 0; i < n; i++) {
-                const V w = has_site(t, i) ? width(t, i) : V(0.0);
-                s.m[t * n + i] = V(0.0);
-                s.D[t * n + i] = w * w * V(1.0 / 3.0);
-            }
-        for (int k = 0; k < a.rows; k++) {
-            s.nu[k] = V(0.0);
-            if (kind(k) == noise_gaussian) {
-                s.tau[k] = V(1.0 / a.R[k]);
-            } else if (kind(k) >= noise_contaminated) {  // bounds, and rows that may say nothing: not until they are asked
-                s.tau[k] = V(0.0);
-            } else {
-                const V w = a.group[k] >= 0 ? s.s[a.group[k]] : V(0.0);
-                s.tau[k] = V(1.0) / (w * w * V(1.0 / 3.0) + variance(k));
-            }
-        }
+            for (int i = 0; i < n; i++) start_noise(t, i);
+        for (int k = 0; k < a.rows; k++) start_row(k);
         forget();
+    }
+    void start_noise(int t, int i) {
+        const V w = has_site(t, i) ? width(t, i) : V(0.0);
+        s.m[t * n + i] = V(0.0);
+        s.D[t * n + i] = w * w * V(1.0 / 3.0);
+    }
+    void start_row(int k) {
+        s.nu[k] = V(0.0);
+        if (kind(k) == noise_gaussian) {
+            s.tau[k] = V(1.0 / a.R[k]);
+        } else if (kind(k) >= noise_contaminated) {  // bounds, and rows that may say nothing: not until they are asked
+            s.tau[k] = V(0.0);
+        } else {
+            const V w = a.group[k] >= 0 ? s.s[a.group[k]] : V(0.0);
+            s.tau[k] = V(1.0) / (w * w * V(1.0 / 3.0) + variance(k));
+        }
     }
 
     // no message from the future
@@ -327,7 +334,7 @@ struct Ep {
                 f.top += densest(k);
                 if (kind(k) == noise_gaussian) {
                     f.log_z -= V(0.5) * V(log_2pi + std::log(a.R[k]));
-                    if (cross.S) cross.r3[k] = cross.r4[k] = V(0.0);
+                    if (bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
                 }
             }
             if (kind(k) != noise_gaussian) {
@@ -340,10 +347,10 @@ struct Ep {
                     z += h[i] * ms[i];
                 }
                 if (silent(k) && far_inside(k, z, v)) {
-                    if (!renew && cross.S) cross.r3[k] = cross.r4[k] = V(0.0);
+                    if (!renew && bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
                     continue;
                 }
-                renew_row<renew>(k, z, v, Ph, ms, Ps, f, damping);
+                renew_row<renew>(t, k, z, v, Ph, ms, Ps, f, damping);
             }
             fold<renew>(k, h, mf, Pf, f);
         }
@@ -355,7 +362,7 @@ struct Ep {
     }
 
     template <bool renew>
-    inline void renew_row(int k, const V& z, V v, const V* Ph, V* ms, V* Ps, EpFound& f, double damping) {
+    inline void renew_row(int t, int k, const V& z, V v, const V* Ph, V* ms, V* Ps, EpFound& f, double damping) {
         // the cavity; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
         const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9)), over_open = V(1.0) / open;
         v = larger(v, V(1e-300));
@@ -383,13 +390,13 @@ struct Ep {
                 for (int j = 0; j < n; j++) Ps[i * n + j] -= g * Ph[j];
             }
         } else {
-            const Tilted<X> q = cross.S ? tilted<cumulants>(k, cavity) : tilted<evidence>(k, cavity);
+            const Tilted<X> q = bent(t) ? tilted<cumulants>(k, cavity) : tilted<evidence>(k, cavity);
             const V tv = larger(of(q.var), V(1e-300));
             note(f, z, v, of(q.mean), tv, V(1.0) / tv, cavity);
             f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], mu, c);
             f.worst = smaller(f.worst, of(q.log_z) + unit(k));
             slopes(k, q, v, f);
-            if (cross.S) ratios(q, v, cross.r3 + k, cross.r4 + k);
+            if (bent(t)) ratios(q, v, cross.r3 + k, cross.r4 + k);
             if (a.out) {
                 for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++)
                     a.out[static_cast<std::ptrdiff_t>(block.first + l) * a.rows + k] = q.out[l];
@@ -451,35 +458,69 @@ struct Ep {
         f.slope[a.groups] += of(q.slope_eps);
     }
 
-    // ---- the two halves of a sweep -------------------------------------------------------------------------------
+    // mp, Pp of stage t >= 1 from the filtered mf, Pf of the one before
+    inline void predict(int t, const V* A, const V* G, const V* mf, const V* Pf, V* mp, V* Pp) const {
+        V AP[cap * cap];
+        noise(t, G, Pp, mp);
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0);
+                for (int k = 0; k < n; k++) q += A[i * n + k] * Pf[k * n + j];
+                AP[i * n + j] = q;
+                mp[i] += A[i * n + j] * mf[j];
+            }
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j <= i; j++) {
+                V q = Pp[i * n + j];
+                for (int k = 0; k < n; k++) q += AP[i * n + k] * A[j * n + k];
+                Pp[i * n + j] = Pp[j * n + i] = q;
+            }
+    }
 
-    template <bool renew>
-    void forward(EpFound& f, double damping) {
-        V A[cap * cap], G[cap * cap], mf[cap], Pf[cap * cap];
-        if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
-        if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
+    // the predicted moments of the sites as they are
+    void filter() {
+        V A[cap * cap], G[cap * cap] = {}, mf[cap], Pf[cap * cap];
+        EpFound none{};
         for (int t = 0; t <= a.T; t++) {
             V mp[cap], Pp[cap * cap];
             if (t == 0) {
                 prior(mp, Pp);
             } else {
-                V AP[cap * cap];
+                block.loads(a.A, t - 1, n * n, A);
+                if (a.G.data) block.loads(a.G, t - 1, n * n, G);
+                predict(t, A, G, mf, Pf, mp, Pp);
+            }
+            for (int i = 0; i < n; i++) s.mp[t * n + i] = mf[i] = mp[i];
+            pack(Pp, s.Pp + t * packed());
+            for (int i = 0; i < n * n; i++) Pf[i] = Pp[i];
+            for (int k = a.start[t]; k < a.start[t + 1]; k++) {
+                if (silent(k)) continue;
+                V h[cap];
+                row(k, h);
+                fold<true>(k, h, mf, Pf, none);
+            }
+        }
+    }
+
+    // ---- the two halves of a sweep -------------------------------------------------------------------------------
+
+    // from stage `from` on, whose predicted moments are known where it is not the first
+    template <bool renew>
+    void forward(EpFound& f, double damping, int from = 0) {
+        V A[cap * cap], G[cap * cap], mf[cap], Pf[cap * cap];
+        if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
+        if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
+        for (int t = from; t <= a.T; t++) {
+            V mp[cap], Pp[cap * cap];
+            if (t == 0) {
+                prior(mp, Pp);
+            } else if (t == from) {
+                for (int i = 0; i < n; i++) mp[i] = s.mp[t * n + i];
+                unpack(s.Pp + t * packed(), Pp);
+            } else {
                 if (a.A.count != 1) block.loads(a.A, t - 1, n * n, A);
                 if (a.G.data && a.G.count != 1) block.loads(a.G, t - 1, n * n, G);
-                noise(t, G, Pp, mp);
-                for (int i = 0; i < n; i++)
-                    for (int j = 0; j < n; j++) {
-                        V q(0.0);
-                        for (int k = 0; k < n; k++) q += A[i * n + k] * Pf[k * n + j];
-                        AP[i * n + j] = q;
-                        mp[i] += A[i * n + j] * mf[j];
-                    }
-                for (int i = 0; i < n; i++)
-                    for (int j = 0; j <= i; j++) {
-                        V q = Pp[i * n + j];
-                        for (int k = 0; k < n; k++) q += AP[i * n + k] * A[j * n + k];
-                        Pp[i * n + j] = Pp[j * n + i] = q;
-                    }
+                predict(t, A, G, mf, Pf, mp, Pp);
             }
             for (int i = 0; i < n; i++) s.mp[t * n + i] = mp[i];
             pack(Pp, s.Pp + t * packed());
@@ -502,13 +543,15 @@ struct Ep {
                 }
                 rows<renew>(t, ms, Ps, mf, Pf, f, damping);
             }
-            if (!renew && cross.S)
+            if (!renew && bent(t + 1))
                 for (int i = 0; i < n * n; i++) cross.Pf[t * n * n + i] = Pf[i];
         }
     }
 
+    // To the first of two stages in a row whose moments agreed within `quiet` in every lane that is alive; returns it.
     template <bool renew>
-    void backward(EpFound& f) {
+    int backward(EpFound& f, double quiet = 0.0) {
+        int calm = 0;
         V A[cap * cap], G[cap * cap];
         if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
         if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
@@ -527,11 +570,22 @@ struct Ep {
                 for (int j = 0; j < n; j++) gap[i] -= Lambda[i * n + j] * s.mp[t * n + j];
             }
             less(W, Pp, gap, r);
-            if (!renew && cross.S) covariances(t, A, G, W, Pp);
+            if (!renew && bent(t)) covariances(t, A, G, W, Pp);
             if (t > 0 && a.G.data) turn(G, W, r);
+            const V before = f.residual;
+            if (renew) f.residual = V(0.0);
             sites<renew>(t, W, r, f);
             if (t > 0) pass_on(t, A, G, Lambda, eta, U);
+            if (renew) {
+                bool still = quiet > 0.0;
+                for (int l = 0; l < wide_lanes; l++)
+                    if (alive(f, l) && !(f.residual[l] < quiet * quiet)) still = false;
+                calm = still ? calm + 1 : 0;
+                f.residual = larger(before, f.residual);
+                if (calm == 2) return t;
+            }
         }
+        return 0;
     }
 
     // Lambda, eta of t and the root U of Lambda become the message to t - 1
@@ -561,11 +615,14 @@ struct Ep {
         }
     }
 
+    inline void nothing_after() {
+        for (int i = 0; i < n; i++) s.eb[a.T * n + i] = V(0.0);
+        for (int i = 0; i < packed(); i++) s.Lb[a.T * packed() + i] = V(0.0);
+    }
     // the future's messages of the sites as they are
     void hear() {
         V A[cap * cap], G[cap * cap] = {}, Lambda[cap * cap], eta[cap], U[cap * cap];
-        for (int i = 0; i < n; i++) s.eb[a.T * n + i] = V(0.0);
-        for (int i = 0; i < packed(); i++) s.Lb[a.T * packed() + i] = V(0.0);
+        nothing_after();
         for (int t = a.T; t > 0; t--) {
             block.loads(a.A, t - 1, n * n, A);
             if (a.G.data) block.loads(a.G, t - 1, n * n, G);
@@ -621,11 +678,10 @@ struct Ep {
     }
 
     // Third and fourth cumulants of the states, to first order in what the sites leave out: a factor whose tilted
-    // distribution has the cumulant k_r adds (Cov(x, z) / Var(z))^r k_r. Factors more than `reach` rows away count as
-    // Gaussian: they add with the r-th power of a small correlation. Of the stages from `first` on.
-    void shapes(double* k3, double* k4, int first = 0) const {
-        constexpr int reach = 4;
-        for (int t = first; t <= a.T; t++) {
+    // distribution has the cumulant k_r adds (Cov(x, z) / Var(z))^r k_r. Factors more than `shape_reach` rows away count as
+    // Gaussian: they add with the r-th power of a small correlation. Of the stages from `shaped` on.
+    void shapes(double* k3, double* k4) const {
+        for (int t = shaped; t <= a.T; t++) {
             V c3[cap], c4[cap], R[cap * cap], M[cap * cap];
             for (int i = 0; i < n; i++) c3[i] = c4[i] = V(0.0);
             const V* S = cross.S + t * n * n;
@@ -636,7 +692,7 @@ struct Ep {
                     R[i] = S[i];
                     M[i] = V(i % (n + 1) == 0 ? 1.0 : 0.0);
                 }
-                for (int l = 1; l <= reach; l++) {
+                for (int l = 1; l <= shape_reach; l++) {
                     const int u = side == 0 ? t + l : t - l;
                     if (u < 0 || u > a.T) break;
                     if (l > 1) gain(R, side == 0 ? u - 1 : u + 1, M);  // Cov(x_t, x_v) Cov(x_v)^-1, v next to u
@@ -768,7 +824,7 @@ struct Ep {
         V *m = s.m + t * n, *D = s.D + t * n;
         for (int i = 0; i < n; i++) {
             if (!has_site(t, i)) {
-                if (!renew && cross.S) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
+                if (!renew && bent(t)) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
                 continue;
             }
             const V half = larger(width(t, i), V(1e-150)), square = half * half;
@@ -796,7 +852,7 @@ struct Ep {
                 D[i] += dD;
                 m[i] += dm;
             } else {
-                const Tilted<X> q = cross.S ? uniform4<cumulants>(cavity, half.v) : uniform4<evidence>(cavity, half.v);
+                const Tilted<X> q = bent(t) ? uniform4<cumulants>(cavity, half.v) : uniform4<evidence>(cavity, half.v);
                 const V tv = larger(of(q.var), V(1e-300));
                 note(f, mean, var, of(q.mean), tv, V(1.0) / tv, cavity);
                 const V spread = D[i] + c, d = m[i] - mu;
@@ -807,7 +863,7 @@ struct Ep {
                     f.slope[a.group_w[i]] += of(q.slope_s);
                     f.learned[a.group_w[i]] += share * share;
                 }
-                if (cross.S) ratios(q, var, cross.w3 + t * n + i, cross.w4 + t * n + i);
+                if (bent(t)) ratios(q, var, cross.w3 + t * n + i, cross.w4 + t * n + i);
             }
         }
     }
@@ -843,18 +899,49 @@ struct Ep {
 
     // Sweep until the moments agree within `tol` in every lane that is alive; returns the sweeps. A lane is dead when its
     // numbers are no longer finite or a factor lies thousands of standard deviations from where the others put it: no
-    // trajectory fits, and its sites run away.
+    // trajectory fits, and its sites run away. What a sweep finds it then mends: what is left is expected to fall at the
+    // rate seen, at best to a quarter.
     int settle(EpFound& f, int sweeps, double tol, double damping) {
-        reach = min2(max2(2.0 * std::log(1e3 / max2(tol, 1e-300)), 20.0), 72.0);
-        faint = min2(max2(2e-3 * tol, 1e-13), 1e-4);
+        fineness(tol);
+        V before(1e300);
         for (int k = 1; k <= sweeps; k++) {
             sweep(f, damping);
-            bool done = true;
-            for (int l = 0; l < wide_lanes; l++)
-                if (alive(f, l) && !(f.residual[l] < tol)) done = false;
-            if (done) return k;
+            if (settled(f, before, tol)) return k;
+            before = f.residual;
         }
         return sweeps;
+    }
+    // The same from sites that fit but for those of the newest stages: each sweep goes back as far as it changes anything.
+    // Returns the stages gone over.
+    int settle_end(EpFound& f, int sweeps, double tol, double damping) {
+        fineness(tol);
+        filter();
+        nothing_after();
+        V before(1e300);
+        int stages = 0;
+        for (int k = 1; k <= sweeps; k++) {
+            clear(f);
+            const int from = backward<true>(f, 0.3 * tol);
+            forward<true>(f, damping, from);
+            f.residual = root(f.residual);
+            stages += a.T + 1 - from;
+            if (settled(f, before, tol)) break;
+            before = f.residual;
+        }
+        hear();
+        return stages;
+    }
+    void fineness(double tol) {
+        reach = min2(max2(2.0 * std::log(1e3 / max2(tol, 1e-300)), 20.0), 72.0);
+        faint = min2(max2(2e-3 * tol, 1e-13), 1e-4);
+    }
+    bool settled(const EpFound& f, const V& before, double tol) const {
+        bool done = true;
+        for (int l = 0; l < wide_lanes; l++) {
+            const double rate = min2(max2(f.residual[l] / before[l], 0.25), 1.0);
+            if (alive(f, l) && !(f.residual[l] * (before[l] < 1e300 ? rate : 1.0) < 0.7 * tol)) done = false;
+        }
+        return done;
     }
     static inline bool alive(const EpFound& f, int l) { return finite(f.residual[l]) && f.far[l] < 1e8; }
 

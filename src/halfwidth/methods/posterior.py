@@ -33,7 +33,7 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
-from halfwidth.methods._carry import WARP, Carried, Known, Start
+from halfwidth.methods._carry import HANDED_ON, WARP, Carried, Known, Start
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Frame, Sites, gaussian_part, sites, uniform_part
 from halfwidth.model import Linear, Model, Nonlinear
@@ -59,6 +59,8 @@ _EVENT = 26
 _LONG = 2000
 _FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
+#: A window takes over the mode and the nodes of the one before, at most so often in a row and in an eighth of its rows.
+_AGAIN = 4
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
@@ -277,6 +279,7 @@ class Posterior:
         z, log_proposal = nodes(q, self.nodes if q else 1)
         limits = dict(_LIMITS)
         limits["condition"] = max(0.0, 1.0 - _EVENT / max(len(chain.problem["start"]) - 2, 1))
+        limits["again"] = min((len(chain.problem["start"]) - 2) // 8, _AGAIN)
         rows = max(float(chain.count.sum()), 1.0)
         limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
         limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
@@ -413,10 +416,9 @@ class Answer(NamedTuple):
     @property
     def start(self) -> Start:
         """Where the mode is, for the next evaluation of this chain or of one that begins some rows later."""
-        s = self.chain.floor.copy()
-        free = self.chain.free
-        s[free] = np.exp(self.found["mode"][: np.count_nonzero(free)])
-        before = (self.chain.problem["start"], *self.found["sites"])
+        s, free, found = self.chain.floor.copy(), self.chain.free, self.found
+        s[free] = np.exp(found["mode"][: np.count_nonzero(free)])
+        before = (self.chain.problem["start"], *found["sites"], *(found[name] for name in HANDED_ON))
         return Start(np.where(free, s, self.chain.cap), before)
 
     @property
