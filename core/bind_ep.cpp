@@ -273,6 +273,8 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     found["sites"] = p.sites(std::nullopt, 1);
     const std::size_t columns = (nodes + abreast - 1) / abreast * abreast;
     int since = 0;
+    bool sound = false;
+    l.finite = &sound;
     l.since = &since;
     l.again = whole("again");
     l.columns = static_cast<int>(columns);
@@ -371,6 +373,7 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     found["code"] = code;
     found["effective"] = effective;
     found["since"] = since;
+    found["finite"] = sound;
     found["rate"] = nb::none();
     if (learn_eps) found["rate"] = found_rate;
     found["log_evidence"] = log_evidence;

@@ -214,6 +214,7 @@ int ep_learn(const EpLearnArgs& given) {
     const int code = learn_any(a);
     if (code >= 2) return code;
     const int q = static_cast<int>(learner_parameters(a));
+    *a.finite = ep_sound(a);
     ep_widths(a, q, rest);
     ep_told(a, q, rest);
     ep_edge(a.base, a.base.m, a.base.D, a.base.tau, a.base.nu, a.edge_x, a.edge_P, rest);

@@ -504,9 +504,20 @@ struct Ep {
 
     // ---- the two halves of a sweep -------------------------------------------------------------------------------
 
-    // from stage `from` on, whose predicted moments are known where it is not the first
+    // Whether every lane that is alive has agreed within `quiet` in a stage, after `before` in those gone over so far.
+    bool still(EpFound& f, const V& before, double quiet) const {
+        bool calm = quiet > 0.0;
+        for (int l = 0; l < wide_lanes; l++)
+            if (alive(f, l) && !(f.residual[l] < quiet * quiet)) calm = false;
+        f.residual = larger(before, f.residual);
+        return calm;
+    }
+
+    // From stage `from` on, whose predicted moments are known where it is not the first, to the second of two in a row that
+    // are still; returns it.
     template <bool renew>
-    void forward(EpFound& f, double damping, int from = 0) {
+    int forward(EpFound& f, double damping, int from = 0, double quiet = 0.0) {
+        int calm = 0;
         V A[cap * cap], G[cap * cap], mf[cap], Pf[cap * cap];
         if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
         if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
@@ -541,21 +552,28 @@ struct Ep {
                     give(t, ms, Ps);
                     for (int i = 0; i < n * n; i++) cross.S[t * n * n + i] = Ps[i];
                 }
+                const V before = f.residual;
+                if (renew) f.residual = V(0.0);
                 rows<renew>(t, ms, Ps, mf, Pf, f, damping);
+                if (renew) {
+                    calm = still(f, before, quiet) ? calm + 1 : 0;
+                    if (calm == 2) return t;
+                }
             }
             if (!renew && bent(t + 1))
                 for (int i = 0; i < n * n; i++) cross.Pf[t * n * n + i] = Pf[i];
         }
+        return a.T;
     }
 
-    // To the first of two stages in a row whose moments agreed within `quiet` in every lane that is alive; returns it.
+    // From stage `from` back to the second of two in a row that are still; returns it.
     template <bool renew>
-    int backward(EpFound& f, double quiet = 0.0) {
+    int backward(EpFound& f, int from, double quiet = 0.0) {
         int calm = 0;
         V A[cap * cap], G[cap * cap];
         if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
         if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
-        for (int t = a.T; t >= 0; t--) {
+        for (int t = from; t >= 0; t--) {
             V Lambda[cap * cap], eta[cap], Pp[cap * cap], U[cap * cap], W[cap * cap], r[cap], gap[cap];
             if (t > 0) {
                 if (a.A.count != 1) block.loads(a.A, t - 1, n * n, A);
@@ -577,11 +595,7 @@ struct Ep {
             sites<renew>(t, W, r, f);
             if (t > 0) pass_on(t, A, G, Lambda, eta, U);
             if (renew) {
-                bool still = quiet > 0.0;
-                for (int l = 0; l < wide_lanes; l++)
-                    if (alive(f, l) && !(f.residual[l] < quiet * quiet)) still = false;
-                calm = still ? calm + 1 : 0;
-                f.residual = larger(before, f.residual);
+                calm = still(f, before, quiet) ? calm + 1 : 0;
                 if (calm == 2) return t;
             }
         }
@@ -893,14 +907,13 @@ struct Ep {
     void sweep(EpFound& f, double damping) {
         clear(f);
         forward<true>(f, damping);
-        backward<true>(f);
+        backward<true>(f, a.T);
         f.residual = root(f.residual);
     }
 
     // Sweep until the moments agree within `tol` in every lane that is alive; returns the sweeps. A lane is dead when its
     // numbers are no longer finite or a factor lies thousands of standard deviations from where the others put it: no
-    // trajectory fits, and its sites run away. What a sweep finds it then mends: what is left is expected to fall at the
-    // rate seen, at best to a quarter.
+    // trajectory fits, and its sites run away.
     int settle(EpFound& f, int sweeps, double tol, double damping) {
         fineness(tol);
         V before(1e300);
@@ -911,17 +924,18 @@ struct Ep {
         }
         return sweeps;
     }
-    // The same from sites that fit but for those of the newest stages: each sweep goes back as far as it changes anything.
-    // Returns the stages gone over.
-    int settle_end(EpFound& f, int sweeps, double tol, double damping) {
+    // The same from sites that fit but for those near either end of the chain: each sweep goes as far as it changes
+    // anything. Returns the stages gone over.
+    int settle_ends(EpFound& f, int sweeps, double tol, double damping) {
         fineness(tol);
         filter();
         nothing_after();
+        const double quiet = 0.3 * tol;
         V before(1e300);
         int stages = 0;
         for (int k = 1; k <= sweeps; k++) {
             clear(f);
-            const int from = backward<true>(f, 0.3 * tol);
+            const int from = backward<true>(f, a.T, quiet);
             forward<true>(f, damping, from);
             f.residual = root(f.residual);
             stages += a.T + 1 - from;
@@ -929,19 +943,40 @@ struct Ep {
             before = f.residual;
         }
         hear();
+        before = V(1e300);
+        for (int k = 1; k <= sweeps; k++) {
+            clear(f);
+            const int to = forward<true>(f, damping, 0, quiet);
+            backward<true>(f, to);
+            f.residual = root(f.residual);
+            stages += to + 1;
+            if (settled(f, before, tol)) break;
+            before = f.residual;
+        }
         return stages;
     }
     void fineness(double tol) {
         reach = min2(max2(2.0 * std::log(1e3 / max2(tol, 1e-300)), 20.0), 72.0);
         faint = min2(max2(2e-3 * tol, 1e-13), 1e-4);
     }
+    // What a sweep finds it then mends: what is left is expected to fall at the rate seen, at best to a quarter.
     bool settled(const EpFound& f, const V& before, double tol) const {
-        bool done = true;
+        V left = f.residual;
+        for (int l = 0; l < wide_lanes; l++)
+            if (before[l] < 1e300) left.set(l, left[l] * min2(max2(left[l] / before[l], 0.25), 1.0));
+        return within(f, left, 0.7 * tol);
+    }
+    // whether `left` is below tol on average over the lanes that are alive, and not far above in any
+    bool within(const EpFound& f, const V& left, double tol) const {
+        double sum = 0.0;
+        int count = 0;
         for (int l = 0; l < wide_lanes; l++) {
-            const double rate = min2(max2(f.residual[l] / before[l], 0.25), 1.0);
-            if (alive(f, l) && !(f.residual[l] * (before[l] < 1e300 ? rate : 1.0) < 0.7 * tol)) done = false;
+            if (!alive(f, l)) continue;
+            if (!(left[l] < 3.0 * tol)) return false;
+            sum += left[l];
+            count++;
         }
-        return done;
+        return sum <= count * tol;
     }
     static inline bool alive(const EpFound& f, int l) { return finite(f.residual[l]) && f.far[l] < 1e8; }
 
@@ -949,7 +984,7 @@ struct Ep {
     void look(EpFound& f) {
         clear(f);
         forward<false>(f, 1.0);
-        backward<false>(f);
+        backward<false>(f, a.T);
         f.residual = root(f.residual);
     }
     static inline bool sound(const EpFound& f, int l) {

@@ -104,6 +104,7 @@ struct EpLearnArgs {
     double *told_pull, *told_precision;                      // (groups,), (groups,groups): what the rows tell
     int columns;                                             // nodes in whole registers
     double *lanes, *lane_phi;  // (2 sites, columns): m and nu, then D and tau, of each; (columns, q) its parameters, or NaN
+    bool* finite;                                            // whether x and P are
     int* since;                                              // windows since the mode was searched for
     double *edge_x, *edge_P;                                 // (T+1,n), (T+1,n,n): x_t given what lies up to t
 };

@@ -271,6 +271,19 @@ inline void ep_told(const EpLearnArgs& a, int q, double* work) {
     }
 }
 
+// Whether the moments of the states are numbers; a shape that is none is that of a Gaussian.
+inline bool ep_sound(const EpLearnArgs& a) {
+    const std::ptrdiff_t size = std::ptrdiff_t(a.base.T + 1) * a.base.n;
+    bool sound = true;
+    for (std::ptrdiff_t k = 0; k < size; k++) {
+        sound = sound && finite(a.x[k]);
+        if (!finite(a.k3[k])) a.k3[k] = 0.0;
+        if (!finite(a.k4[k])) a.k4[k] = 0.0;
+    }
+    for (std::ptrdiff_t k = 0; k < size * a.base.n; k++) sound = sound && finite(a.P[k]);
+    return sound;
+}
+
 // Mean (T+1,n) and covariance (T+1,n,n) of x_t given what lies up to t, by the sites m, D, tau, nu of member 0.
 // work (4 n^2 + 2 n)
 inline void ep_edge(const EpArgs& a, const double* m, const double* D, const double* tau, const double* nu, double* found_x,

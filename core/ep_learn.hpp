@@ -214,7 +214,7 @@ struct EpLearner {
 
     // ---- lanes go on where those of the window before were ---------------------------------------------------------
 
-    // how the sites of an evaluation begin: afresh, where they were left, or so but for the newest rows
+    // how the sites of an evaluation begin: afresh, where they were left, or so but for rows that have come and gone
     enum Begin { afresh, led, resumed };
 
     static inline V load(const double* p) {
@@ -284,10 +284,9 @@ struct EpLearner {
     void evaluate(const double (*phi)[ep_free], int most, double tol, double* value, double (*slope)[ep_free], Begin begin) {
         bool done = false;
         if (begin == resumed) {
-            sweeps += ep.settle_end(f, most, tol, a.base.damping) / (a.base.T + 1) + 1;
+            sweeps += ep.settle_ends(f, most, tol, a.base.damping) / (a.base.T + 1) + 1;
             ep.look(f);
-            done = true;
-            for (int l = 0; l < wide_lanes; l++) done = done && (f.residual[l] < tol || !Ep<N>::alive(f, l));
+            done = ep.within(f, f.residual, tol);
         } else if (begin == led) {
             ep.hear();
         }

@@ -42,7 +42,6 @@ from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box, Normal, Shaped
 
-_STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
 POWER = 0.85
 #: Of the search and the nodes. The mode of the window before is a good centre of nodes up to the distance `near`, in
@@ -314,42 +313,35 @@ class Posterior:
         return float(self.outliers), False, (1.0, 1.0)
 
     def _estimate(self, chain: Sites, found: dict[str, Any], model: Linear, record: Record) -> Estimate:
-        nx = model.nx
-        code, residual = int(found["code"]), float(found["residual"])
-        status = _STATUS[code]
-        x, P, k3, k4 = found["x"], found["P"], found["k3"], found["k4"]
-        sound = code < 2 and bool(np.isfinite(x).all() and np.isfinite(P).all())
+        nx, residual, K = model.nx, found["residual"], found["nodes"]
+        sound = found["code"] < 2 and found["finite"]
         info: dict[str, Any] = {"notes": []}
-        s = np.where(chain.free, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), chain.floor)
-        widths = {"mean": s, "sd": np.zeros_like(s), "lo": s, "hi": s}
-        if sound:
-            widths = {name: found[name] for name in widths}
-        if sound:
-            one = found["nodes"] == 1 and found["mode"].size > 0
-            few = code == 1 if one else found["nodes"] > 1 and found["effective"] < _FEW
-            status = Status.STALLED if residual > _USABLE else Status.REDUCED if residual > _FINE or few else Status.OK
         loglik: float | None = None
         if sound:
+            x, P = found["x"], found["P"]
+            widths = {name: found[name] for name in ("mean", "sd", "lo", "hi")}
             q = found["mode"].size
-            loglik = float(found["log_evidence"] - found["log_prior"] - 0.5 * q * math.log(2 * math.pi))
+            few = found["effective"] < _FEW if K > 1 else found["code"] == 1 and q > 0
+            status = Status.STALLED if residual > _USABLE else Status.REDUCED if residual > _FINE or few else Status.OK
+            loglik = found["log_evidence"] - found["log_prior"] - 0.5 * q * math.log(2 * math.pi)
         else:
-            status = Status.INFEASIBLE if code >= 2 else Status.STALLED
+            status = Status.INFEASIBLE if found["code"] >= 2 else Status.STALLED
+            s = np.where(chain.free, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), chain.floor)
+            widths = {"mean": s, "sd": np.zeros_like(s), "lo": s, "hi": s}
             x, P = self._fallback(chain, s)
-            k3 = k4 = np.zeros_like(x)
             info["hint"] = "wider half-widths, outliers=True, or missing outputs; BatchLP() names the rows in conflict"
             info["message"] = (
                 f"{status.value}, or the iteration ran away from it; "
                 "states are those of a Gaussian smoother with the same variances"
             )
-        k3, k4 = (np.where(np.isfinite(k), k, 0.0) for k in (k3, k4))
-        box = model.bounds if isinstance(model.bounds, Box) else None
-        within = None if box is None else (np.asarray(box.lo), np.asarray(box.hi))
-        if box is not None:
-            x = np.concatenate([x[:1], np.clip(x[1:], box.lo, box.hi)])
+        within = None
+        if isinstance(model.bounds, Box):
+            within = (np.asarray(model.bounds.lo), np.asarray(model.bounds.hi))
+            x[1:] = np.minimum(np.maximum(x[1:], within[0]), within[1])
         if chain.exact or not sound:
-            spread: Any = Normal.of(x[1:].copy(), P[1:].copy(), within)
+            spread: Any = Normal.of(x[1:].copy(), P[1:], within)
         else:
-            spread = Shaped(x[1:].copy(), P[1:].copy(), k3[1:].copy(), k4[1:].copy(), within)
+            spread = Shaped(x[1:].copy(), P[1:], found["k3"][1:], found["k4"][1:], within)
         gamma = None
         if found["out"] is not None and not sound and model.loss is None:
             info |= {"outliers": [], "outlier_probability": np.where(record.seen, 0.0, np.nan)}
@@ -362,20 +354,18 @@ class Posterior:
             else:
                 info["outliers"] = _named(share, model, record)
                 info["outlier_probability"] = share
-        has_q, has_r = chain.uniform[:nx].any(), chain.uniform[nx:].any()
-        lost = chain.uniform & (chain.floor < chain.cap) & (chain.count == 0)
-        if lost.any():
-            names = [*model.names.x, *model.names.y]
-            info["notes"].append(
-                "bound not identifiable: " + ", ".join(n for n, m in zip(names, lost, strict=True) if m)
-            )
+        if not chain.count.all():
+            lost = chain.uniform & (chain.floor < chain.cap) & (chain.count == 0)
+            names = [name for name, m in zip((*model.names.x, *model.names.y), lost, strict=True) if m]
+            if names:
+                info["notes"].append("bound not identifiable: " + ", ".join(names))
         info |= {
             "x0": x[0].copy(),
             "half_widths": widths,
             "rate": found["rate"] if sound else None,
             "residual": residual,
-            "sweeps": int(found["sweeps"]),
-            "nodes": int(found["nodes"]),
+            "sweeps": found["sweeps"],
+            "nodes": K,
             "effective": found["effective"] if sound else 0.0,
         }
         return Estimate(
@@ -383,9 +373,9 @@ class Posterior:
             x[1:].copy(),
             spread,
             status,
-            typed(self),
-            q=widths["mean"][:nx].copy() if has_q and sound else None,
-            r=widths["mean"][nx:].copy() if has_r and sound else None,
+            _typed(self),
+            q=widths["mean"][:nx].copy() if sound and uniform_part(model.w) is not None else None,
+            r=widths["mean"][nx:].copy() if sound and uniform_part(model.e) is not None else None,
             gamma=gamma,
             loglik=loglik,
             names=model.names.x,
@@ -425,6 +415,11 @@ class Answer(NamedTuple):
     def told(self) -> Known:
         """What its rows tell of the half-widths."""
         return Known(self.found["told_pull"], self.found["told_precision"])
+
+
+@functools.lru_cache(maxsize=64)
+def _typed(method: Posterior) -> str:
+    return typed(method)
 
 
 def _named(share: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
