@@ -159,6 +159,7 @@ struct EpCross {
 template <class N>
 struct Ep {
     static constexpr int cap = ep_cap<N>;
+    static constexpr int abreast = 3;  // sites of a stage that are renewed at a time
     N n;
     const EpArgs& a;
     EpBlock block;
@@ -323,36 +324,66 @@ struct Ep {
         f.residual = larger(f.residual, either(tv.v >= q.c * (1.0 - 1e-9), V(0.0), gap));
     }
 
+    // residual z, its variance v and covariance Ph with x_t, of row k in a belief
+    inline void project(int k, const V* h, const V* ms, const V* Ps, V* Ph, V* z, V* v) const {
+        *z = -target(k);
+        *v = V(0.0);
+        for (int i = 0; i < n; i++) {
+            V q(0.0);
+            for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
+            Ph[i] = q;
+            *v += h[i] * q;
+            *z += h[i] * ms[i];
+        }
+    }
+
     // renew (or, for the evidence, look at) the rows of stage t given the belief ms, Ps about x_t; fold each into the
-    // filtered mf, Pf
+    // filtered mf, Pf. Rows are renewed `abreast` at a time from one belief: their moments do not wait for each other.
     template <bool renew>
     inline void rows(int t, V* ms, V* Ps, V* mf, V* Pf, EpFound& f, double damping) {
-        for (int k = a.start[t]; k < a.start[t + 1]; k++) {
-            V h[cap], Ph[cap];
-            row(k, h);
-            if constexpr (!renew) {
-                f.top += densest(k);
-                if (kind(k) == noise_gaussian) {
-                    f.log_z -= V(0.5) * V(log_2pi + std::log(a.R[k]));
-                    if (bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
+        for (int first = a.start[t]; first < a.start[t + 1]; first += abreast) {
+            const int last = first + abreast < a.start[t + 1] ? first + abreast : a.start[t + 1];
+            V h[abreast][cap], dt[abreast], dn[abreast];
+            bool says[abreast];
+            for (int k = first; k < last; k++) {
+                const int c = k - first;
+                row(k, h[c]);
+                says[c] = false;
+                if constexpr (!renew) {
+                    f.top += densest(k);
+                    if (kind(k) == noise_gaussian) {
+                        f.log_z -= V(0.5) * V(log_2pi + std::log(a.R[k]));
+                        if (bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
+                    }
                 }
-            }
-            if (kind(k) != noise_gaussian) {
-                V z = -target(k), v(0.0);
-                for (int i = 0; i < n; i++) {
-                    V q(0.0);
-                    for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
-                    Ph[i] = q;
-                    v += h[i] * q;
-                    z += h[i] * ms[i];
-                }
+                if (kind(k) == noise_gaussian) continue;
+                V Ph[cap], z, v;
+                project(k, h[c], ms, Ps, Ph, &z, &v);
                 if (silent(k) && far_inside(k, z, v)) {
                     if (!renew && bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
                     continue;
                 }
-                renew_row<renew>(t, k, z, v, Ph, ms, Ps, f, damping);
+                says[c] = true;
+                if constexpr (renew) propose(k, z, v, dt + c, dn + c, f, damping);
+                else look_at(t, k, z, v, f);
             }
-            fold<renew>(k, h, mf, Pf, f);
+            for (int k = first; k < last; k++) {
+                const int c = k - first;
+                if (renew && says[c]) {
+                    V Ph[cap], z, v;
+                    project(k, h[c], ms, Ps, Ph, &z, &v);
+                    const V gain = V(1.0) / larger(V(1.0) + dt[c] * v, V(1e-12));
+                    s.tau[k] += dt[c];
+                    s.nu[k] += dn[c];
+                    const V shift = (dn[c] - dt[c] * z) * gain, shrink = dt[c] * gain;
+                    for (int i = 0; i < n; i++) {
+                        ms[i] += Ph[i] * shift;
+                        const V g = Ph[i] * shrink;
+                        for (int j = 0; j < n; j++) Ps[i * n + j] -= g * Ph[j];
+                    }
+                }
+                if (says[c] || kind(k) == noise_gaussian) fold<renew>(k, h[c], mf, Pf, f);
+            }
         }
     }
     // both ends of a bound out of reach in every lane
@@ -361,61 +392,51 @@ struct Ep {
         return !any4((up < X{}) | (down < X{}) | (up * up < least) | (down * down < least) | (v.v != v.v));
     }
 
-    template <bool renew>
-    inline void renew_row(int t, int k, const V& z, V v, const V* Ph, V* ms, V* Ps, EpFound& f, double damping) {
-        // the cavity; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
+    // the cavity of row k; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
+    inline Cavity<X> cavity_of(int k, const V& z, const V& v) const {
         const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9)), over_open = V(1.0) / open;
-        v = larger(v, V(1e-300));
-        const V over_v = V(1.0) / v;
-        const V c = smaller(v * over_open, V(1e300)), mu = (z - v * s.nu[k]) * over_open, w = open * over_v;
-        const V scale = root(w);
-        const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};
-        if constexpr (renew) {
-            const Tilted<X> q = tilted<moments>(k, cavity);
-            const V tv = larger(of(q.var), V(1e-300)), tm = of(q.mean), over = V(1.0) / tv;
-            note(f, z, v, tm, tv, over, cavity);
-            // else the factor widens the belief: nothing for now
-            const auto says = tv.v < c.v * (1.0 - (kind(k) == ep_truncation ? faint : 1e-13));
-            const V tau = either(says, over - w, V(0.0)), nu = either(says, tm * over - mu * w, V(0.0));
-            // by what the site changes: a site that stays leaves the belief as it is, whatever rounding made of v
-            const V step(kind(k) >= noise_contaminated && kind(k) != ep_truncation ? damping : 1.0);
-            const V dt = step * (tau - s.tau[k]), dn = step * (nu - s.nu[k]);
-            const V gain = V(1.0) / larger(V(1.0) + dt * v, V(1e-12));
-            s.tau[k] += dt;
-            s.nu[k] += dn;
-            const V shift = (dn - dt * z) * gain, shrink = dt * gain;
-            for (int i = 0; i < n; i++) {
-                ms[i] += Ph[i] * shift;
-                const V g = Ph[i] * shrink;
-                for (int j = 0; j < n; j++) Ps[i * n + j] -= g * Ph[j];
-            }
-        } else {
-            const Tilted<X> q = bent(t) ? tilted<cumulants>(k, cavity) : tilted<evidence>(k, cavity);
-            const V tv = larger(of(q.var), V(1e-300));
-            note(f, z, v, of(q.mean), tv, V(1.0) / tv, cavity);
-            f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], mu, c);
-            f.worst = smaller(f.worst, of(q.log_z) + unit(k));
-            slopes(k, q, v, f);
-            if (bent(t)) ratios(q, v, cross.r3 + k, cross.r4 + k);
-            if (a.out) {
-                for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++)
-                    a.out[static_cast<std::ptrdiff_t>(block.first + l) * a.rows + k] = q.out[l];
-            }
+        const V c = smaller(v * over_open, V(1e300)), mu = (z - v * s.nu[k]) * over_open, scale = root(open / v);
+        return {mu.v, c.v, (c * scale).v, scale.v};
+    }
+
+    // the change of row k's site that reproduces its moments
+    inline void propose(int k, const V& z, const V& spread, V* dt, V* dn, EpFound& f, double damping) const {
+        const V v = larger(spread, V(1e-300));
+        const Cavity<X> cavity = cavity_of(k, z, v);
+        const V scale = of(cavity.scale), w = scale * scale;
+        const Tilted<X> q = tilted<moments>(k, cavity);
+        const V tv = larger(of(q.var), V(1e-300)), tm = of(q.mean), over = V(1.0) / tv;
+        note(f, z, v, tm, tv, over, cavity);
+        // else the factor widens the belief: nothing for now
+        const auto says = tv.v < cavity.c * (1.0 - (kind(k) == ep_truncation ? faint : 1e-13));
+        const V tau = either(says, over - w, V(0.0)), nu = either(says, tm * over - of(cavity.mu) * w, V(0.0));
+        // by what the site changes: a site that stays leaves the belief as it is, whatever rounding made of v
+        const V step(kind(k) >= noise_contaminated && kind(k) != ep_truncation ? damping : 1.0);
+        *dt = step * (tau - s.tau[k]);
+        *dn = step * (nu - s.nu[k]);
+    }
+
+    inline void look_at(int t, int k, const V& z, const V& spread, EpFound& f) {
+        const V v = larger(spread, V(1e-300));
+        const Cavity<X> cavity = cavity_of(k, z, v);
+        const Tilted<X> q = bent(t) ? tilted<cumulants>(k, cavity) : tilted<evidence>(k, cavity);
+        const V tv = larger(of(q.var), V(1e-300));
+        note(f, z, v, of(q.mean), tv, V(1.0) / tv, cavity);
+        f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], of(cavity.mu), of(cavity.c));
+        f.worst = smaller(f.worst, of(q.log_z) + unit(k));
+        slopes(k, q, v, f);
+        if (bent(t)) ratios(q, v, cross.r3 + k, cross.r4 + k);
+        if (a.out) {
+            for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++)
+                a.out[static_cast<std::ptrdiff_t>(block.first + l) * a.rows + k] = q.out[l];
         }
     }
 
     // site of row k into the filtered moments mf, Pf
     template <bool renew>
     inline void fold(int k, const V* h, V* mf, V* Pf, EpFound& f) {
-        V Ph[cap];
-        V z = -target(k), v(0.0);
-        for (int i = 0; i < n; i++) {
-            V q(0.0);
-            for (int j = 0; j < n; j++) q += Pf[i * n + j] * h[j];
-            Ph[i] = q;
-            v += h[i] * q;
-            z += h[i] * mf[i];
-        }
+        V Ph[cap], z, v;
+        project(k, h, mf, Pf, Ph, &z, &v);
         const V tau = s.tau[k], gain = V(1.0) / (V(1.0) + tau * v);
         if constexpr (!renew) f.log_z += integral(tau, s.nu[k], z, v);
         const V shift = (s.nu[k] - tau * z) * gain, shrink = tau * gain;
@@ -833,29 +854,52 @@ struct Ep {
         for (int i = 0; i < n; i++) r[i] = g[i];
     }
 
+    // renew (or look at) the sites of w_t given W, r; `abreast` at a time, as the rows
     template <bool renew>
     inline void sites(int t, V* W, V* r, EpFound& f) {
         V *m = s.m + t * n, *D = s.D + t * n;
-        for (int i = 0; i < n; i++) {
-            if (!has_site(t, i)) {
-                if (!renew && bent(t)) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
-                continue;
+        for (int first = 0; first < n; first += abreast) {
+            const int last = first + abreast < n ? first + abreast : int(n);
+            V dD[abreast], dm[abreast];
+            for (int i = first; i < last; i++) {
+                if (!has_site(t, i)) {
+                    if (!renew && bent(t)) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
+                    continue;
+                }
+                const V half = larger(width(t, i), V(1e-150)), square = half * half;
+                V know = W[i * n + i];
+                if (any4(know.v * square.v < all<X>(1e-8))) know = larger(know, V(1e-8) / square);  // nothing known: a wide cavity
+                const V over_know = V(1.0) / know, told = D[i] * know, open = larger(V(1.0) - told, V(1e-12) * told);
+                const V c = open * over_know, mu = m[i] + r[i] * over_know, w = know / open, scale = root(w);
+                const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};
+                const V mean = m[i] + D[i] * r[i], var = D[i] * (V(1.0) - told);
+                if constexpr (renew) {
+                    const Tilted<X> q = uniform4<moments>(cavity, half.v);
+                    const V tv = of(q.var), tm = of(q.mean);
+                    note(f, mean, var, tm, larger(tv, V(1e-300)), V(1.0) / larger(tv, V(1e-300)), cavity);
+                    const V rest = larger(V(1.0) - tv * w, V(1e-6));  // 1 - tilted variance over the cavity's
+                    const V over = V(1.0) / rest;
+                    dD[i - first] = tv * over - D[i];
+                    dm[i - first] = mu + (tm - mu) * over - m[i];
+                } else {
+                    const Tilted<X> q = bent(t) ? uniform4<cumulants>(cavity, half.v) : uniform4<evidence>(cavity, half.v);
+                    const V tv = larger(of(q.var), V(1e-300));
+                    note(f, mean, var, of(q.mean), tv, V(1.0) / tv, cavity);
+                    const V spread = D[i] + c, d = m[i] - mu;
+                    f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + log_of(spread) + d * d / spread);
+                    f.worst = smaller(f.worst, of(q.log_z) + log_of(V(2.0) * half));
+                    if (t > 0) {
+                        const V share = larger(V(1.0) - V(3.0) * var / square, V(0.0));
+                        f.slope[a.group_w[i]] += of(q.slope_s);
+                        f.learned[a.group_w[i]] += share * share;
+                    }
+                    if (bent(t)) ratios(q, var, cross.w3 + t * n + i, cross.w4 + t * n + i);
+                }
             }
-            const V half = larger(width(t, i), V(1e-150)), square = half * half;
-            V know = W[i * n + i];
-            if (any4(know.v * square.v < all<X>(1e-8))) know = larger(know, V(1e-8) / square);  // nothing known: a wide cavity
-            const V over_know = V(1.0) / know, told = D[i] * know, open = larger(V(1.0) - told, V(1e-12) * told);
-            const V c = open * over_know, mu = m[i] + r[i] * over_know, w = know / open, scale = root(w);
-            const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};
-            const V mean = m[i] + D[i] * r[i], var = D[i] * (V(1.0) - told);
-            if constexpr (renew) {
-                const Tilted<X> q = uniform4<moments>(cavity, half.v);
-                const V tv = of(q.var), tm = of(q.mean);
-                note(f, mean, var, tm, larger(tv, V(1e-300)), V(1.0) / larger(tv, V(1e-300)), cavity);
-                const V rest = larger(V(1.0) - tv * w, V(1e-6));  // 1 - tilted variance over the cavity's
-                const V over = V(1.0) / rest, dD = tv * over - D[i], dm = mu + (tm - mu) * over - m[i];
-                const V gain = V(1.0) / larger(V(1.0) + dD * W[i * n + i], V(1e-12));
-                const V shift = (r[i] * dD + dm) * gain, shrink = dD * gain;
+            for (int i = first; renew && i < last; i++) {
+                if (!has_site(t, i)) continue;
+                const V gain = V(1.0) / larger(V(1.0) + dD[i - first] * W[i * n + i], V(1e-12));
+                const V shift = (r[i] * dD[i - first] + dm[i - first]) * gain, shrink = dD[i - first] * gain;
                 V column[cap];
                 for (int j = 0; j < n; j++) column[j] = W[j * n + i];
                 for (int j = 0; j < n; j++) {
@@ -863,21 +907,8 @@ struct Ep {
                     const V g = column[j] * shrink;
                     for (int k = 0; k < n; k++) W[j * n + k] -= g * column[k];
                 }
-                D[i] += dD;
-                m[i] += dm;
-            } else {
-                const Tilted<X> q = bent(t) ? uniform4<cumulants>(cavity, half.v) : uniform4<evidence>(cavity, half.v);
-                const V tv = larger(of(q.var), V(1e-300));
-                note(f, mean, var, of(q.mean), tv, V(1.0) / tv, cavity);
-                const V spread = D[i] + c, d = m[i] - mu;
-                f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + log_of(spread) + d * d / spread);
-                f.worst = smaller(f.worst, of(q.log_z) + log_of(V(2.0) * half));
-                if (t > 0) {
-                    const V share = larger(V(1.0) - V(3.0) * var / square, V(0.0));
-                    f.slope[a.group_w[i]] += of(q.slope_s);
-                    f.learned[a.group_w[i]] += share * share;
-                }
-                if (bent(t)) ratios(q, var, cross.w3 + t * n + i, cross.w4 + t * n + i);
+                D[i] += dD[i - first];
+                m[i] += dm[i - first];
             }
         }
     }
