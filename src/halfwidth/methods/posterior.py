@@ -47,8 +47,8 @@ POWER = 0.85
 #: Of the search and the nodes. The mode of the window before is a good centre of nodes up to the distance `near`, in
 #: standard deviations.
 _LIMITS = {
-    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "near": 0.8, "least": 0.3,
-    "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
+    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "near": 0.8,
+    "least": 0.3, "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
 }  # fmt: skip
 #: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone
 #: shape the path. In longer records bounds are a condition in the others.
@@ -101,13 +101,13 @@ class Posterior:
     half-widths and entries, and ``ess``, their smallest effective number of draws; the status is REDUCED above an R-hat
     of 1.01 and STALLED above 1.05. Of "ep":
 
-    ``q``, ``r`` are posterior means. ``loglik`` is the logarithm of the evidence, half-widths integrated out under a
-    prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
-    count as a factor in 26 rows and as a condition in the others. In ``info``: ``x0``; ``half_widths``, a mapping
-    with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %) of (q, r); ``outliers``, the named outputs with a
-    probability above one half; ``residual``,
-    the disagreement of moments in standard deviations, the largest of each node; ``sweeps``; ``nodes`` and their
-    ``effective`` number.
+    ``q``, ``r`` are posterior means, ``Q``, ``R`` those of unknown variances. ``loglik`` is the logarithm of the
+    evidence, half-widths and standard deviations integrated out under a prior one unit of log s wide around their mode,
+    so that models with more unknowns do not win by that alone; bounds count as a factor in 26 rows and as a condition
+    in the others. In ``info``: ``x0``; ``half_widths``, a mapping with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %)
+    of (q, r); ``variances``, the same of (Q, R) where some are unknown; ``outliers``, the named outputs with a
+    probability above one half; ``residual``, the disagreement of moments in standard deviations, the largest of each
+    node; ``sweeps``; ``nodes`` and their ``effective`` number.
 
     Raises
     ------
@@ -216,9 +216,7 @@ class Posterior:
             return with_entries(self, model, record)
         return self.answer(model, record).estimate
 
-    def resumed(
-        self, model: Model, record: Record, held: Carried, first: int, drop: int, shaped: int = 0
-    ) -> "Answer":
+    def resumed(self, model: Model, record: Record, held: Carried, first: int, drop: int, shaped: int = 0) -> "Answer":
         """Return the answer of one window of a stream.
 
         `held` is what earlier windows handed on, `first` the number of the window's first row, which lies `drop` rows
@@ -229,9 +227,7 @@ class Posterior:
             from halfwidth.methods._relinearise import relinearised
 
             return relinearised(self, model, record, s=None if held.start is None else held.start.s, known=known)
-        return self.answer(
-            model, record, start=held.start, drop=drop, known=known, frames=held.frames, shaped=shaped
-        )
+        return self.answer(model, record, start=held.start, drop=drop, known=known, frames=held.frames, shaped=shaped)
 
     def answer(
         self,
@@ -262,16 +258,15 @@ class Posterior:
             except BadShape:  # a noise stacked row by row
                 quick = None
             if quick is not None and int(quick.found["code"]) < 2:
-                start = Start(np.where(quick.chain.free, quick.start.s, math.sqrt(3.0) * problem.scale))
+                start = Start(np.where(quick.chain.free, quick.start.s, problem.guess))
         found = self._solve(problem, model, start, drop, known, shaped)
-        return Answer(self._estimate(problem, found, model, record), problem, found)
+        return Answer(self._estimate(problem, found, model, record), problem, found, self._rate(model)[0])
 
     def _solve(
         self, chain: Sites, model: Linear, start: Start | None, drop: int, known: Known | None, shaped: int
     ) -> dict[str, Any]:
         rate, learn_rate, beta = self._rate(model)
-        first = np.where(chain.uniform, (math.sqrt(3.0) * chain.scale).clip(chain.floor, chain.cap), 0.0)
-        first = np.where(chain.free, first, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
+        first = np.where(chain.free, chain.guess, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
         if start is not None:
             first = np.where(chain.free, start.s.clip(chain.floor, chain.cap), first)
         q = int(chain.free.sum()) + learn_rate
@@ -293,9 +288,10 @@ class Posterior:
         return dict(
             _core.ep_learn(
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
-                learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z, log_proposal,
-                limits, None if start is None else start.before, drop, shaped, None if known is None else known.pull,
-                None if known is None else known.precision, chain.outside if limits["condition"] > 0 else None,
+                chain.fitted, learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z,
+                log_proposal, limits, None if start is None else start.before, drop, shaped,
+                None if known is None else known.pull, None if known is None else known.precision,
+                chain.outside if limits["condition"] > 0 else None,
             )
         )  # fmt: skip
 
@@ -326,8 +322,9 @@ class Posterior:
             loglik = found["log_evidence"] - found["log_prior"] - 0.5 * q * math.log(2 * math.pi)
         else:
             status = Status.INFEASIBLE if found["code"] >= 2 else Status.STALLED
-            s = np.where(chain.free, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), chain.floor)
-            widths = {"mean": s, "sd": np.zeros_like(s), "lo": s, "hi": s}
+            s = np.where(chain.free, chain.guess, chain.floor)
+            value = np.where(chain.fitted, s**2, s)
+            widths = {"mean": value, "sd": np.zeros_like(s), "lo": value, "hi": value}
             x, P = self._fallback(chain, s)
             info["hint"] = "wider half-widths, outliers=True, or missing outputs; BatchLP() names the rows in conflict"
             info["message"] = (
@@ -338,7 +335,7 @@ class Posterior:
         if isinstance(model.bounds, Box):
             within = (np.asarray(model.bounds.lo), np.asarray(model.bounds.hi))
             x[1:] = np.minimum(np.maximum(x[1:], within[0]), within[1])
-        if chain.exact or not sound:
+        if (chain.exact and not chain.free.any()) or not sound:
             spread: Any = Normal.of(x[1:].copy(), P[1:], within)
         else:
             spread = Shaped(x[1:].copy(), P[1:], found["k3"][1:], found["k4"][1:], within)
@@ -354,14 +351,18 @@ class Posterior:
             else:
                 info["outliers"] = _named(share, model, record)
                 info["outlier_probability"] = share
+        p = nx + model.ny
         if not chain.count.all():
-            lost = chain.uniform & (chain.floor < chain.cap) & (chain.count == 0)
-            names = [name for name, m in zip((*model.names.x, *model.names.y), lost, strict=True) if m]
-            if names:
-                info["notes"].append("bound not identifiable: " + ", ".join(names))
+            lost = (chain.uniform | chain.fitted) & (chain.floor < chain.cap) & (chain.count == 0)
+            names = np.array([*model.names.x, *model.names.y])
+            for what, part in (("bound", lost[:p]), ("variance", lost[p:])):
+                if part.any():
+                    info["notes"].append(f"{what} not identifiable: " + ", ".join(names[part]))
+        if len(chain.count) > p:
+            info["variances"] = {name: v[p:] for name, v in widths.items()}
         info |= {
             "x0": x[0].copy(),
-            "half_widths": widths,
+            "half_widths": {name: v[:p] for name, v in widths.items()},
             "rate": found["rate"] if sound else None,
             "residual": residual,
             "sweeps": found["sweeps"],
@@ -375,7 +376,9 @@ class Posterior:
             status,
             _typed(self),
             q=widths["mean"][:nx].copy() if sound and uniform_part(model.w) is not None else None,
-            r=widths["mean"][nx:].copy() if sound and uniform_part(model.e) is not None else None,
+            r=widths["mean"][nx:p].copy() if sound and uniform_part(model.e) is not None else None,
+            Q=widths["mean"][p : p + nx].copy() if sound and chain.fitted[p : p + nx].any() else None,
+            R=widths["mean"][p + nx :].copy() if sound and chain.fitted[p + nx :].any() else None,
             gamma=gamma,
             loglik=loglik,
             names=model.names.x,
@@ -397,11 +400,12 @@ class Posterior:
 
 
 class Answer(NamedTuple):
-    """An estimate, its chain and what the core found."""
+    """An estimate, its chain, what the core found, and the rate of outliers or losses if it is told."""
 
     estimate: Estimate
     chain: Sites
     found: dict[str, Any]
+    rate: float
 
     @property
     def start(self) -> Start:
@@ -456,6 +460,8 @@ def nodes(q: int, count: int) -> tuple[Array, Array]:
 
 
 def _diagonal(part: Gaussian) -> bool:
+    if not part.known:
+        return True
     R = part.cov()
     if not R.constant:
         return False
