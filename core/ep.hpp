@@ -362,7 +362,7 @@ struct Ep {
     inline void rows(int t, V* ms, V* Ps, V* mf, V* Pf, EpFound& f, double damping) {
         for (int first = a.start[t]; first < a.start[t + 1]; first += abreast) {
             const int last = first + abreast < a.start[t + 1] ? first + abreast : a.start[t + 1];
-            V h[abreast][cap], dt[abreast], dn[abreast];
+            V h[abreast][cap], dt[abreast] = {}, dn[abreast] = {};
             bool says[abreast];
             for (int k = first; k < last; k++) {
                 const int c = k - first;
@@ -536,7 +536,7 @@ struct Ep {
 
     // the predicted moments of the sites as they are
     void filter() {
-        V A[cap * cap], G[cap * cap] = {}, mf[cap], Pf[cap * cap];
+        V A[cap * cap], G[cap * cap] = {}, mf[cap] = {}, Pf[cap * cap] = {};
         EpFound none{};
         for (int t = 0; t <= a.T; t++) {
             V mp[cap], Pp[cap * cap];
@@ -575,7 +575,7 @@ struct Ep {
     template <bool renew>
     int forward(EpFound& f, double damping, int from = 0, double quiet = 0.0) {
         int calm = 0;
-        V A[cap * cap], G[cap * cap], mf[cap], Pf[cap * cap];
+        V A[cap * cap], G[cap * cap], mf[cap] = {}, Pf[cap * cap] = {};
         if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
         if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
         for (int t = from; t <= a.T; t++) {
@@ -897,7 +897,7 @@ struct Ep {
         V *m = s.m + t * n, *D = s.D + t * n;
         for (int first = 0; first < n; first += abreast) {
             const int last = first + abreast < n ? first + abreast : int(n);
-            V dD[abreast], dm[abreast];
+            V dD[abreast] = {}, dm[abreast] = {};
             for (int i = first; i < last; i++) {
                 if constexpr (!renew)
                     if (t > 0 && fitted(i)) {  // g_i has the posterior mean p r_i and variance p - p W_ii p

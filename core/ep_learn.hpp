@@ -23,6 +23,7 @@ namespace hw {
 namespace HW_ISA {
 
 constexpr int ep_alone = 10;  // sweeps of a chain with its bounds alone, which starts afresh
+constexpr int ep_few = 2;     // rows that may come or go while the mode stays
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
 template <class N>
@@ -560,7 +561,8 @@ struct EpLearner {
         double best = minus_inf;
         *a.log_prior = 0.0;
         int code = 0;
-        const bool again = q > 0 && warm && a.before->lanes && a.before->since < a.again;
+        const bool again = q > 0 && warm && a.before->lanes && a.before->since < a.again && a.before->drop <= ep_few &&
+                           b.T - a.before->common <= ep_few;
         if (again) {  // where the nodes of the window before were
             for (int j = 0; j < q; j++) {
                 phi[j] = min2(max2(a.before->mode[j], lo[j]), hi[j]);
@@ -678,7 +680,7 @@ struct EpLearner {
                                     : top + 0.5 * q * log_2pi - half_log_det;
         *a.sweeps_used = sweeps;
         *a.since = again ? a.before->since + 1 : 0;
-        if (nodes > 1 && !central(nodes)) *a.since = a.again;
+        if (nodes == 1 || !central(nodes)) *a.since = a.again;
         return code;
     }
 };

@@ -89,8 +89,8 @@ def inside(chain: Sites, s: Array) -> Known:
 class Start(NamedTuple):
     """Where a search may start: half-widths (p,), and the sites of a solved chain that belong to them.
 
-    These are the first row of each of its stages (T + 2,), m and D of its noise, tau and nu of its rows, and `HANDED_ON`
-    (`EpBefore` in core/ep_entry.hpp).
+    These are the first row of each of its stages (T + 2,), m and D of its noise, tau and nu of its rows, and
+    `HANDED_ON` (`EpBefore` in core/ep_entry.hpp).
     """
 
     s: Array

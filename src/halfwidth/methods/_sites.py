@@ -131,7 +131,7 @@ class Frame:
         if self.R is None:
             return True
         size = np.maximum(scale[-len(self.R) :], math.sqrt(_EXACT) * np.abs(y).max())
-        return bool((self.R > 2.0 * _EXACT * size**2).all())
+        return bool((2.0 * _EXACT * size**2 < self.R).all())
 
 
 #: Frames that are kept of one model.

@@ -98,7 +98,10 @@ class Forecasts:
 
     def take(self, x: Array, q: Array, memory: int) -> None:
         """Add the estimate of a window that ends in a fix."""
-        self.x, self.q = np.concatenate((self.x, x[None]))[-memory - 1 :], np.concatenate((self.q, q[None]))[-memory - 1 :]
+        self.x, self.q = (
+            np.concatenate((self.x, x[None]))[-memory - 1 :],
+            np.concatenate((self.q, q[None]))[-memory - 1 :],
+        )
         self.grown = np.zeros_like(self.grown)
 
     def bounds(self) -> tuple[Array, Array, int]:
@@ -192,7 +195,10 @@ class Sliding:
             low, high = np.minimum(low, x[:held]), np.maximum(high, x[:held])
         else:
             open_ = (len(self.times) - 1 <= last[a : a + held])[:, None]
-            low, high = np.where(open_, np.minimum(low, x[:held]), low), np.where(open_, np.maximum(high, x[:held]), high)
+            low, high = (
+                np.where(open_, np.minimum(low, x[:held]), low),
+                np.where(open_, np.maximum(high, x[:held]), high),
+            )
         self.low = np.concatenate((self.low[:a], low, x[held:]))
         self.high = np.concatenate((self.high[:a], high, x[held:]))
         self.x[a:] = x
@@ -254,7 +260,8 @@ class Sliding:
         s = _both(est.q, est.r, model)
         variances = None if est.Q is None and est.R is None else _both(est.Q, est.R, model)
         return Solved(
-            np.concatenate((est.info.get("x0", self.x[a])[None], est.x)), np.zeros(0) if est.theta is None else est.theta, s,
+            np.concatenate((est.info.get("x0", self.x[a])[None], est.x)),
+            np.zeros(0) if est.theta is None else est.theta, s,
             est.status, int(est.info.get("iterations", 0) or 0), info, est.spread, variances,
         )  # fmt: skip
 
@@ -342,7 +349,8 @@ class Sliding:
 
         last = self.last
         return {
-            "t": self.t, "before": self.before, "first": self.first, "pushed": self.pushed, "times": self.times.tolist(),
+            "t": self.t, "before": self.before, "first": self.first, "pushed": self.pushed,
+            "times": self.times.tolist(),
             "y": plain(self.y), "u": plain(self.u), "x": plain(self.x), "low": plain(self.low),
             "high": plain(self.high), "used": self.used.tolist(),
             "edge": self.edge.tolist(), "since": self.since,
