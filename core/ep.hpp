@@ -169,6 +169,7 @@ struct Ep {
     // A bound farther off than the root of `reach` standard deviations, or one that narrows its cavity's variance by a
     // share below `faint`, says nothing at the precision that is asked for.
     double reach = 72.0, faint = 1e-13;
+    bool mixed = false;  // rows with two explanations
 
     // whether a shape that is asked for needs the cumulants of stage t
     inline bool bent(int t) const { return cross.S && t >= shaped - shape_reach; }
@@ -321,6 +322,7 @@ struct Ep {
             }
         }
     }
+    inline bool single(int k) const { return kind(k) < noise_contaminated || kind(k) == ep_truncation; }
     // a bound that no lane has come near
     inline bool silent(int k) const { return kind(k) == ep_truncation && !any4(s.tau[k].v != X{}); }
     inline void row(int k, V* h) const {
@@ -357,11 +359,13 @@ struct Ep {
     }
 
     // renew (or, for the evidence, look at) the rows of stage t given the belief ms, Ps about x_t; fold each into the
-    // filtered mf, Pf. Rows are renewed `abreast` at a time from one belief: their moments do not wait for each other.
+    // filtered mf, Pf. Rows are renewed `abreast` at a time from one belief, so that their moments do not wait for each
+    // other, unless they have two explanations.
     template <bool renew>
     inline void rows(int t, V* ms, V* Ps, V* mf, V* Pf, EpFound& f, double damping) {
-        for (int first = a.start[t]; first < a.start[t + 1]; first += abreast) {
-            const int last = first + abreast < a.start[t + 1] ? first + abreast : a.start[t + 1];
+        for (int first = a.start[t], last; first < a.start[t + 1]; first = last) {
+            last = first + 1;
+            while (single(first) && last < a.start[t + 1] && last - first < abreast && single(last)) last++;
             V h[abreast][cap], dt[abreast] = {}, dn[abreast] = {};
             bool says[abreast];
             for (int k = first; k < last; k++) {
@@ -440,7 +444,7 @@ struct Ep {
         const auto says = tv.v < cavity.c * (1.0 - (kind(k) == ep_truncation ? faint : 1e-13));
         const V tau = either(says, over - w, V(0.0)), nu = either(says, tm * over - of(cavity.mu) * w, V(0.0));
         // by what the site changes: a site that stays leaves the belief as it is, whatever rounding made of v
-        const V step(kind(k) >= noise_contaminated && kind(k) != ep_truncation ? damping : 1.0);
+        const V step(single(k) ? 1.0 : damping);
         *dt = step * (tau - s.tau[k]);
         *dn = step * (nu - s.nu[k]);
     }
@@ -1031,11 +1035,15 @@ struct Ep {
         return stages;
     }
     void fineness(double tol) {
+        mixed = false;
+        for (int k = 0; k < a.rows; k++) mixed = mixed || !single(k);
         reach = min2(max2(2.0 * std::log(1e3 / max2(tol, 1e-300)), 20.0), 72.0);
         faint = min2(max2(2e-3 * tol, 1e-13), 1e-4);
     }
-    // What a sweep finds it then mends: what is left is expected to fall at the rate seen, at best to a quarter.
+    // What a sweep finds it then mends: what is left is expected to fall at the rate seen, at best to a quarter. Rows with
+    // two explanations keep no rate.
     bool settled(const EpFound& f, const V& before, double tol) const {
+        if (mixed) return within(f, f.residual, tol);
         V left = f.residual;
         for (int l = 0; l < wide_lanes; l++)
             if (before[l] < 1e300) left.set(l, left[l] * min2(max2(left[l] / before[l], 0.25), 1.0));
@@ -1047,7 +1055,7 @@ struct Ep {
         int count = 0;
         for (int l = 0; l < wide_lanes; l++) {
             if (!alive(f, l)) continue;
-            if (!(left[l] < 3.0 * tol)) return false;
+            if (!(left[l] < (mixed ? 1.0 : 3.0) * tol)) return false;
             sum += left[l];
             count++;
         }

@@ -376,7 +376,7 @@ class Sliding:
         self.first, self.pushed = int(saved["first"]), int(saved["pushed"])
         self.times = np.array(saved["times"], dtype=float)
         nx, ny, nu = self.model.nx, self.model.ny, self.model.nu
-        self.y, self.u = (np.array(arrays(saved[k])).reshape(-1, n) for k, n in (("y", ny), ("u", nu)))
+        self.y, self.u = (np.array(arrays(saved[k])).reshape(len(saved[k]), n) for k, n in (("y", ny), ("u", nu)))
         self.seen = ~np.isnan(self.y)
         self.x, self.low, self.high = (
             np.array(arrays(saved[k], lost)) for k, lost in (("x", math.nan), ("low", math.inf), ("high", -math.inf))

@@ -63,7 +63,7 @@ _AGAIN = 4
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
-_MIXED = {"most": 20, "damping": 0.5}
+_MIXED = {"most": 20, "few": 8, "damping": 0.5}
 #: Moments that agree this well, in standard deviations, are good, and good enough to be used.
 _FINE, _USABLE = 0.01, 0.1
 #: Fewer effective nodes than this leave an integral over half-widths rough.
