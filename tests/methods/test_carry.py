@@ -182,10 +182,11 @@ def test_sites_go_along_with_their_rows():
 def test_nodes_that_are_taken_over_are_as_good_as_fresh_ones():
     _, record = drawn(40, 11)
     model = system(UNKNOWN, UNKNOWN, bounds=BOX)
+    known = Known(300.0 * np.sqrt(TRUE), 300.0 * np.eye(5))  # of rows before
     start, since = None, []
     for first in range(6):
         part = hw.Record(record.t[first : first + 25], record.y[first : first + 25])
-        answer = hw.Posterior(nodes=11).answer(model, part, start=start, drop=1)
+        answer = hw.Posterior(nodes=20).answer(model, part, start=start, drop=1, known=known)
         found, start = answer.found, answer.start
         since.append(found["since"])
         sound = np.isfinite(found["log_weight"])
