@@ -8,7 +8,8 @@ have been: after a gap from the fixes after them alone, before it from those bef
 proves nothing. What is further off than that can be wrong goes, up to the first fix that agrees again. If none agrees
 the fixes are believed: then the reckoning is wrong, or they are all that is known. They are believed, too, if a jump of
 the receiver's own slow error explains the drive as well (a correction arrives, a satellite is lost): without them the
-path would be bent all the way through the gap.
+path would be bent all the way through the gap. An error that fades (reflections, until enough satellites are back)
+never steps and is easily taken for a drift of the slow error: it is looked for by itself (`fade`).
 """
 
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import chain
+from halfwidth.vehicle.fade import JUDGE, fades, likely
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pointing import azimuth_of
@@ -57,9 +59,12 @@ _NO_NOISE = 1e-4
 #: Fixes that follow wrong ones for so long, away from the gap, are what the other side of the gap is compared with, s.
 _FOLLOW = 8.0
 
-#: How much of the drive on each side of a gap tells wrong fixes from a jump, s; the chain that is asked; how far wrong
-#: fixes may be off, m, and with how many numbers an axis; the logarithm of the odds against them: one gap in ten.
-_SIDE, _JUDGE, _WIDE, _SHAPE, _RARE = 60.0, chain.Chain(rounds=16), 10.0, 3, 2.2
+#: How much of the drive on each side of a gap tells wrong fixes from a jump, s; how far wrong fixes may be off, m, and
+#: with how many numbers an axis; the logarithm of the odds against them: one gap in ten.
+_SIDE, _WIDE, _SHAPE, _RARE = 60.0, 10.0, 3, 2.2
+
+#: Errors that fade are looked for so long from a gap, s, and felt while they exceed the noise of a fix and this, m.
+_FADING, _FELT_M = 30.0, 0.05
 
 #: Scale and bias are known to this many of their standard deviations, and no better than this.
 _KNOWN, _SCALE, _BIAS = 3.0, 0.003, 0.001
@@ -139,6 +144,7 @@ def strays(grid: Grid, sensors: Calibration) -> Strays:
     search = _Search(grid, np.flatnonzero(grid.seen), settings, noise)
     gaps, jumps = _gaps(grid, search.seen), _jumps(grid, search.seen)
     doubts = gaps[:_MOST]
+    search.fade(doubts)
     for k in range(_LOOKS):
         doubts = search.look(doubts, 1.0 if k == 0 else _AGAIN)
     # what a stray stretch begins or ends with is a jump, too
@@ -164,6 +170,11 @@ class _Doubt:
         """Whether the trouble ends a stretch of fixes instead of beginning one."""
         return self.before and not self.after
 
+    @property
+    def gap(self) -> int:
+        """Return which gap a doubt at one of its ends is about: the number of the first fix after it."""
+        return self.block[1] if self.backwards else self.block[0]
+
 
 @dataclass(frozen=True, eq=False)
 class _Answer:
@@ -179,7 +190,7 @@ class _Answer:
 class _Wrong:
     """Fixes that are wrong by what was said about one doubt."""
 
-    clear: float  # how many standard deviations the furthest is off
+    clear: float  # how many standard deviations the furthest is off; of a fade, the logarithm of its odds
     nodes: NDArray[np.intp]
     distance: Floats
 
@@ -218,6 +229,52 @@ class _Search:
             if rest.size:
                 left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0]), known=True))
         return left
+
+    def fade(self, doubts: Sequence[_Doubt]) -> None:
+        """Find errors that fade away from a gap, where one explains the drive better than a jump of the slow error.
+
+        A wrong end of a gap makes the other end look wrong, too: the clearer one goes first, and the other is asked
+        again without those fixes.
+        """
+        for _ in range(2):
+            found = self._fading([doubt for doubt in doubts if self._beside(doubt).size >= _FEWEST])
+            clearest: dict[int, _Doubt] = {}
+            for doubt, wrong in found.items():
+                if doubt.gap not in clearest or wrong.clear > found[clearest[doubt.gap]].clear:
+                    clearest[doubt.gap] = doubt
+            for doubt in clearest.values():
+                self.size[found[doubt].nodes], self.gone[found[doubt].nodes] = found[doubt].distance, True
+            doubts = [doubt for doubt in doubts if clearest.get(doubt.gap, doubt) != doubt]
+
+    def _fading(self, doubts: Sequence[_Doubt]) -> dict[_Doubt, "_Wrong"]:
+        """Find the doubts in which an error that fades explains some fixes, and those that it is felt in."""
+        t = self.grid.t
+        beside = [self._beside(doubt) for doubt in doubts]
+        parts = [self._around(doubt, nodes) for doubt, nodes in zip(doubts, beside, strict=True)]
+        since = [np.abs(t[nodes] - t[self.seen[doubt.first]]) for doubt, nodes in zip(doubts, beside, strict=True)]
+        found = fades(
+            [self.grid.rows(part).masked(self.gone[part]) for part in parts],
+            [nodes - part.start for nodes, part in zip(beside, parts, strict=True)],
+            since,
+        )
+        felt = max(float(self.noise[chain.FIX]), _FELT_M)
+        likely = {}
+        for doubt, nodes, s, fade in zip(doubts, beside, since, found, strict=True):
+            left = fade.left(s)
+            odds = fade.gain - fade.worth - _RARE
+            if odds > 0 and left.max() > felt:
+                likely[doubt] = _Wrong(odds, nodes[left > felt], left[left > felt])
+        against = self._against(list(likely), [wrong.nodes for wrong in likely.values()])
+        return {
+            doubt: wrong for (doubt, wrong), less in zip(likely.items(), against, strict=True) if wrong.clear > less
+        }
+
+    def _beside(self, doubt: _Doubt) -> NDArray[np.intp]:
+        """Return the nodes of the fixes in which an error may fade away from a gap."""
+        t = self.grid.t[self.seen]
+        lo, hi = np.searchsorted(t, t[doubt.first] + np.array([-1.0, 1.0]) * min(doubt.most, _FADING) * (1 + 1e-9))
+        nodes = self.seen[lo : doubt.first + 1] if doubt.backwards else self.seen[doubt.first : hi]
+        return np.asarray(nodes[~self.gone[nodes]])
 
     def _ask(self, doubts: Sequence[_Doubt], lengths: Sequence[float]) -> list[_Answer]:
         """Ask the fixes before, or after, or both, where the doubtful ones should have been."""
@@ -262,9 +319,9 @@ class _Search:
         here = [self.grid.rows(part).masked(self.gone[part]) for part in parts]
         own = [found[doubt].nodes - part.start for doubt, part in zip(asked, parts, strict=True)]
         hidden = [drive.masked(np.isin(np.arange(len(drive)), k)) for drive, k in zip(here, own, strict=True)]
-        without = chain.solve(hidden, _JUDGE) if asked else []
+        without = chain.solve(hidden, JUDGE) if asked else []
         moved = [_put_back(drive, k, fit.path) for drive, k, fit in zip(here, own, without, strict=True)]
-        gain = _likely([*here, *moved]) if asked else []
+        gain = likely([*here, *moved]) if asked else []
         against = self._against(asked, [found[doubt].nodes for doubt in asked])
         better = dict(found)
         for i, (doubt, k, fit) in enumerate(zip(asked, own, without, strict=True)):
@@ -354,28 +411,6 @@ def _put_back(drive: Grid, own: NDArray[np.intp], path: Path) -> Grid:
     east, north = drive.east.copy(), drive.north.copy()
     east[own], north[own] = east[own] - smooth[:, 0], north[own] - smooth[:, 1]
     return replace(drive, east=east, north=north)
-
-
-def _likely(drives: Sequence[Grid]) -> list[float]:
-    """Return the log-likelihood of the fixes of drives under a chain whose offset jumps, but not inside gaps.
-
-    The scales and the weights w of the increments of the offset are learnt first. To the likelihood given the weights
-    comes what they cost, (tail / 2) (log w - w + 1) each: with the best weight it is the logarithm of Student's density
-    but for a constant. In a gap nothing tells a jump, and what is a fault would hide in one there.
-    """
-    learnt = chain.solve(drives, _JUDGE)
-    gaps = [chain.in_gap(drive) for drive in drives]
-    weights = [np.where(gap, 1.0, fit.weight) for gap, fit in zip(gaps, learnt, strict=True)]
-    fits = chain.solve(
-        drives,
-        replace(_JUDGE, tail=np.inf, rounds=2),
-        sigma=np.array([fit.sigma for fit in learnt]),
-        azimuth=[fit.z[:, chain.AZIMUTH] for fit in learnt],
-        weight=weights,
-        learn=False,
-    )
-    costs = [0.5 * _JUDGE.tail * float(np.sum(np.log(w[1:]) - w[1:] + 1.0)) for w in weights]
-    return [fit.loglik + cost for fit, cost in zip(fits, costs, strict=True)]
 
 
 def _most(answer: _Answer) -> float:
