@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import chain
-from halfwidth.vehicle.fade import JUDGE, fades, likely
+from halfwidth.vehicle.fade import JUDGE, Fade, fades, likely
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pointing import azimuth_of
@@ -209,6 +209,20 @@ class _Search:
 
         A share of what is unusual is enough after fixes that were wrong.
         """
+        clearest = self._clearest(doubts, share)
+        odds = self._odds(clearest)
+        left = []
+        for doubt in [doubt for doubt in clearest if odds[doubt] >= 0]:
+            stray = clearest[doubt]
+            self.size[stray.nodes], self.gone[stray.nodes] = stray.distance, True
+            rest = np.flatnonzero(~self.gone[self.seen[doubt.block[0] : doubt.block[1]]]) + doubt.block[0]
+            rest = rest[rest <= doubt.first] if doubt.backwards else rest[rest >= doubt.first]
+            if rest.size:
+                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0]), known=True))
+        return left
+
+    def _clearest(self, doubts: Sequence[_Doubt], share: float = 1.0) -> dict[_Doubt, "_Wrong"]:
+        """Find which of the doubtful fixes are further off than others are, at the length that says so the clearest."""
         clearest: dict[_Doubt, _Wrong] = {}
         for answer in self._ask(doubts, DOUBTED):
             doubt, nodes = answer.doubt, answer.nodes
@@ -221,14 +235,7 @@ class _Search:
                 clear = float((distance / sd)[wrong].max())
                 if doubt not in clearest or clear > clearest[doubt].clear:
                     clearest[doubt] = _Wrong(clear, nodes[wrong], distance[wrong])
-        left = []
-        for doubt, stray in self._confirmed(clearest).items():
-            self.size[stray.nodes], self.gone[stray.nodes] = stray.distance, True
-            rest = np.flatnonzero(~self.gone[self.seen[doubt.block[0] : doubt.block[1]]]) + doubt.block[0]
-            rest = rest[rest <= doubt.first] if doubt.backwards else rest[rest >= doubt.first]
-            if rest.size:
-                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0]), known=True))
-        return left
+        return clearest
 
     def fade(self, doubts: Sequence[_Doubt]) -> None:
         """Find errors that fade away from a gap, where one explains the drive better than a jump of the slow error.
@@ -247,7 +254,10 @@ class _Search:
             doubts = [doubt for doubt in doubts if clearest.get(doubt.gap, doubt) != doubt]
 
     def _fading(self, doubts: Sequence[_Doubt]) -> dict[_Doubt, "_Wrong"]:
-        """Find the doubts in which an error that fades explains some fixes, and those that it is felt in."""
+        """Find the doubts in which an error that fades explains some fixes best, and those that it is felt in.
+
+        Where reckoning is so many times worse than the chain takes it to be, likelihoods say less by the square of it.
+        """
         t = self.grid.t
         beside = [self._beside(doubt) for doubt in doubts]
         parts = [self._around(doubt, nodes) for doubt, nodes in zip(doubts, beside, strict=True)]
@@ -258,16 +268,21 @@ class _Search:
             since,
         )
         felt = max(float(self.noise[chain.FIX]), _FELT_M)
-        likely = {}
+        hope: dict[_Doubt, tuple[Fade, _Wrong]] = {}
         for doubt, nodes, s, fade in zip(doubts, beside, since, found, strict=True):
             left = fade.left(s)
             odds = fade.gain - fade.worth - _RARE
             if odds > 0 and left.max() > felt:
-                likely[doubt] = _Wrong(odds, nodes[left > felt], left[left > felt])
-        against = self._against(list(likely), [wrong.nodes for wrong in likely.values()])
-        return {
-            doubt: wrong for (doubt, wrong), less in zip(likely.items(), against, strict=True) if wrong.clear > less
-        }
+                hope[doubt] = fade, _Wrong(odds, nodes[left > felt], left[left > felt])
+        against = self._against(list(hope), [wrong.nodes for _, wrong in hope.values()])
+        rival = self._odds(self._clearest(list(hope)))
+        better = {}
+        for (doubt, (fade, wrong)), less in zip(hope.items(), against, strict=True):
+            times = _unusual(self._usual(doubt, DOUBTED[1]))
+            likely = (fade.gain - less) / times**2 > fade.worth + _RARE
+            if likely and wrong.clear - less > rival.get(doubt, 0.0):
+                better[doubt] = wrong
+        return better
 
     def _beside(self, doubt: _Doubt) -> NDArray[np.intp]:
         """Return the nodes of the fixes in which an error may fade away from a gap."""
@@ -305,14 +320,15 @@ class _Search:
             for doubt, length, nodes, parts in asked
         ]
 
-    def _confirmed(self, found: dict[_Doubt, "_Wrong"]) -> dict[_Doubt, "_Wrong"]:
-        """Keep the doubts in which wrong fixes explain the drive better than a jump of the receiver's slow error.
+    def _odds(self, found: dict[_Doubt, "_Wrong"]) -> dict[_Doubt, float]:
+        """Return how much better wrong fixes explain the drive than a jump of the receiver's slow error, as logarithms.
 
         The chain that knows such jumps learns from the drive around the gap as it is, and from the same with the
         doubtful fixes put back by as much as they are off: by a constant, a trend and a bend, as far as they are
         enough. The likelihood must grow by more than what these numbers are worth, each the logarithm of how little of
         `_WIDE` is left for it, and by how rare wrong fixes are. Next to some that are wrong it need only grow. What the
-        other side of the gap says against it counts as well. In the middle of fixes both sides were asked before.
+        other side of the gap says against it counts as well. In the middle of fixes both sides were asked before, and
+        the odds are 0.
         """
         asked = [doubt for doubt in found if doubt.before != doubt.after]
         parts = [self._around(doubt, found[doubt].nodes) for doubt in asked]
@@ -323,14 +339,13 @@ class _Search:
         moved = [_put_back(drive, k, fit.path) for drive, k, fit in zip(here, own, without, strict=True)]
         gain = likely([*here, *moved]) if asked else []
         against = self._against(asked, [found[doubt].nodes for doubt in asked])
-        better = dict(found)
+        odds = dict.fromkeys(found, 0.0)
         for i, (doubt, k, fit) in enumerate(zip(asked, own, without, strict=True)):
             spread = fit.path.variance
             left = np.nan if spread is None else float(np.sqrt(np.median(spread[k])))
             worth = _RARE + 2 * min(k.size, _SHAPE) * max(np.log(_WIDE / left), 0.0)
-            if gain[len(asked) + i] - gain[i] - against[i] < (0.0 if doubt.known else worth):
-                del better[doubt]
-        return better
+            odds[doubt] = gain[len(asked) + i] - gain[i] - against[i] - (0.0 if doubt.known else worth)
+        return odds
 
     def _against(self, doubts: Sequence[_Doubt], wrong: Sequence[NDArray[np.intp]]) -> list[float]:
         """Return by how much the other side of each gap, alone, comes nearer to the doubtful fixes than to those that
