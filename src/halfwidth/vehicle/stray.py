@@ -280,14 +280,16 @@ class _Search:
         for (doubt, (fade, wrong)), less in zip(hope.items(), against, strict=True):
             times = _unusual(self._usual(doubt, DOUBTED[1]))
             likely = (fade.gain - less) / times**2 > fade.worth + _RARE
-            if likely and wrong.clear - less > rival.get(doubt, 0.0):
+            # of two that are about as likely, the one that leaves nothing behind
+            if likely and wrong.clear - less > rival.get(doubt, 0.0) - _RARE:
                 better[doubt] = wrong
         return better
 
     def _beside(self, doubt: _Doubt) -> NDArray[np.intp]:
         """Return the nodes of the fixes in which an error may fade away from a gap."""
         t = self.grid.t[self.seen]
-        lo, hi = np.searchsorted(t, t[doubt.first] + np.array([-1.0, 1.0]) * min(doubt.most, _FADING) * (1 + 1e-9))
+        half = float(t[doubt.block[1] - 1] - t[doubt.block[0]]) / 2
+        lo, hi = np.searchsorted(t, t[doubt.first] + np.array([-1.0, 1.0]) * min(half, _FADING) * (1 + 1e-9))
         nodes = self.seen[lo : doubt.first + 1] if doubt.backwards else self.seen[doubt.first : hi]
         return np.asarray(nodes[~self.gone[nodes]])
 
