@@ -101,11 +101,11 @@ def test_wrong_first_fixes_after_a_gap_do_not_bend_it(drive, clean, seconds, eas
     assert item.evidence["off_m"]
 
 
-def test_multipath_that_fades_bends_a_gap_less_than_it_could(clean):
+def test_multipath_that_fades_does_not_bend_a_gap(clean):
     truth, log = simulate_drive(seed=4, multipath=30.0, multipath_time=2.0, **DRIVE)
     track = fill(log)
     assert said(track, "where the vehicle cannot have been")
-    assert in_gaps(truth, track) < 6
+    assert in_gaps(truth, track) < 2 * clean + 1
     assert in_gaps(truth, fill(log, distrust=False)) > 15
 
 
@@ -289,11 +289,11 @@ def test_a_speed_that_is_stuck_in_a_gap_is_taken_for_none(drive):
 
 
 @pytest.mark.parametrize("seed", [22, 23])
-def test_multipath_that_fades_on_consumer_fixes_bends_a_gap_less_than_half(seed):
+def test_multipath_that_fades_on_consumer_fixes_does_not_bend_a_gap(seed):
     truth, log = simulate_drive(
         duration=330.0, outages=GAPS, fix_noise=0.5, fix_offset=1.0, seed=seed, multipath=15.0, multipath_time=3.0
     )
-    assert in_gaps(truth, fill(log)) < 0.5 * 15.0  # 12 to 13 m where it is believed
+    assert in_gaps(truth, fill(log)) < 3  # 1.6 to 1.9 m without it, 12 to 13 m where it is believed
 
 
 def test_on_the_command_line_each_fault_is_named_with_the_line_to_type(drive, tmp_path, capsys):
