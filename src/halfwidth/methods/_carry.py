@@ -43,6 +43,16 @@ WARP = 0.5
 _SWEEPS, _WORST = 50, -60.0
 
 
+#: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone
+#: shape the path. In longer records bounds are a condition in the others.
+EVENT = 26
+
+
+def condition(rows: float) -> float:
+    """Return the power of the evidence of the bounds alone that the evidence of so many rows is divided by."""
+    return max(0.0, 1.0 - EVENT / max(rows, 1.0))
+
+
 class Known(NamedTuple):
     """What is known of half-widths (q, r): the logarithm pull' u - u' precision u / 2 in u = s^(1/2)."""
 
@@ -57,6 +67,10 @@ class Known(NamedTuple):
     def plus(self, other: "Known", weight: float = 1.0) -> "Known":
         """Add what other rows told."""
         return Known(self.pull + weight * other.pull, self.precision + weight * other.precision)
+
+    def times(self, weight: float) -> "Known":
+        """Return it weighted."""
+        return Known(weight * self.pull, weight * self.precision)
 
     def of(self, free: NDArray[np.bool_]) -> "Known":
         """Return what is known of the free ones alone, whatever the others are, as a proper Gaussian."""
@@ -99,7 +113,7 @@ def told(answer: "Answer") -> Known:
         pull = g[0] + H @ u[0]
     else:
         sound = np.isfinite(log_weight) & np.isfinite(g).all(axis=1)
-        u, g, log_weight = u[sound], g[sound], log_weight[sound]
+        u, g, log_weight, second = u[sound], g[sound], log_weight[sound], found["second"][:K][sound]
         if len(u) < q + 2:
             return known
         for flat in (1.0, 0.5, 0.25, 0.0):  # few nodes carry the weight: they alone cannot tell a slope
@@ -113,7 +127,8 @@ def told(answer: "Answer") -> Known:
         S[np.diag_indices(q)] *= 1.0 + 1e-6
         H = -np.linalg.solve(S, (w[:, None] * du).T @ dg)
         H = 0.5 * (H + H.T)
-        pull = level + H @ mean
+        # what log Z lacks has no slope of its own: that of a line through the nodes
+        pull = level + np.linalg.solve(S, du.T @ (w * second)) + H @ mean
     if np.isfinite(H).all() and np.isfinite(pull).all():
         known.precision[np.ix_(free, free)] = H
         known.pull[free] = pull
@@ -231,8 +246,10 @@ class Carried:
 
     def __init__(self, p: int, rows: float) -> None:
         self.fade = math.exp(-1.0 / rows)
-        self.gone = Known.none(p)
-        self.waiting: list[tuple[int, Known]] = []  # newest row of a window, and what it told, weighted
+        self.gone, self.kept_in = Known.none(p), Known.none(p)  # by windows that have left, and their bounds alone
+        self.rows = 0.0  # rows that have left, faded
+        self.waiting: list[tuple[int, Known, Known]] = []  # newest row of a window, and both, weighted
+        self.inside = Known.none(p)  # bounds alone of the last window asked
         self.s: Array | None = None
         self.count = 0  # windows that told something
         self.warm: Warm | None = None
@@ -240,12 +257,17 @@ class Carried:
         self._edge: list[tuple[Array, Array]] | None = None  # messages of the newest window's stages ...
         self._newest: Answer | None = None  # ... or what they are made of
 
-    def known(self, first: int) -> Known | None:
-        """Return what the windows tell that have no row from `first` on, None where there is none."""
-        self.gone = Known(self.gone.pull * self.fade, self.gone.precision * self.fade)
+    def known(self, first: int, rows: int) -> Known | None:
+        """Return what the windows tell that have no row from `first` on, for one of so many rows; None: nothing."""
+        self.gone, self.kept_in = self.gone.times(self.fade), self.kept_in.times(self.fade)
+        self.rows *= self.fade
         while self.waiting and self.waiting[0][0] < first:
-            self.gone = self.gone.plus(self.waiting.pop(0)[1])
-        return self.gone if self.gone.precision.any() else None
+            _, told_, inside_ = self.waiting.pop(0)
+            self.gone, self.kept_in = self.gone.plus(told_), self.kept_in.plus(inside_)
+            self.rows += 1.0
+        if not self.rows:
+            return None
+        return self.gone.plus(self.kept_in.plus(self.inside), -condition(rows + self.rows))
 
     def leave(self, a: int) -> None:
         """Let go of the first a rows of the newest window: they tell the state that the next one begins at."""
@@ -271,11 +293,10 @@ class Carried:
         self.warm = Warm(self.s, answer.chain.problem["start"], answer.found["sites"])
         if not counts:
             return
-        known = Known.none(len(self.s)).plus(told(answer), 1.0 / rows)
         if self.count % rows == 0:
-            known = known.plus(inside(answer.chain, self.s), -1.0)
+            self.inside = inside(answer.chain, self.s)
         self.count += 1
-        self.waiting.append((newest, known))
+        self.waiting.append((newest, told(answer).times(1.0 / rows), self.inside.times(1.0 / rows)))
 
     def save(self) -> dict[str, Any]:
         """Return all of it as plain numbers."""

@@ -258,9 +258,9 @@ class Sliding:
         assert isinstance(method, Posterior)
         seen = np.asarray(part.seen.any(axis=1))
         warm = None if held.warm is None else (held.warm, a)
-        answer = method.resumed(model, part, held.s, held.known(self.first + a), warm)
-        newest = self.first + len(self.times) - 1
         rows = max(int(seen.sum()), self.window.memory + 1)
+        answer = method.resumed(model, part, held.s, held.known(self.first + a, rows), warm)
+        newest = self.first + len(self.times) - 1
         held.take(answer, newest, rows, counts=bool(seen[-1]))
         return answer.estimate
 

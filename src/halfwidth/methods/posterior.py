@@ -25,6 +25,7 @@ Perturbative corrections for approximate inference in Gaussian latent variable m
 import functools
 import math
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -33,7 +34,7 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
-from halfwidth.methods._carry import WARP, Known, Warm
+from halfwidth.methods._carry import WARP, Known, Warm, condition
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Sites, gaussian_part, sites, uniform_part
 from halfwidth.model import Linear, Model, Nonlinear
@@ -44,14 +45,14 @@ from halfwidth.spread import Box, Normal, Shaped
 
 _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
-POWER = 0.85
+POWER = 0.5
+#: Nodes of a stage, and most stages (core/ep_learn.hpp).
+_STAGE, _STAGES = 16, 8
 _LIMITS = {
     "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "least": 0.3,
     "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
+    "stage": _STAGE, "enough": 0.0, "usable": 0.1,
 }  # fmt: skip
-#: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone
-#: shape the path. In longer records bounds are a condition in the others.
-_EVENT = 26
 #: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
 #: with them; there is less left to integrate.
 _LONG = 2000
@@ -272,14 +273,14 @@ class Posterior:
             first = np.where(chain.free, np.clip(start.s, chain.floor, chain.cap), first)
             sites_, was = start.sites, first if start.sites is not None else None
         q = int(chain.free.sum()) + learn_rate
-        z, log_proposal = nodes(q, self.nodes if q else 1)
         limits = dict(_LIMITS)
-        limits["condition"] = max(0.0, 1.0 - _EVENT / max(len(chain.problem["start"]) - 2, 1))
+        limits["condition"] = condition(len(chain.problem["start"]) - 2) if known is None else 0.0  # `known` sees to it
         rows = max(float(chain.count.sum()), 1.0)
         limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
         limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
         if rows > _LONG:
             limits |= _OF_LONG
+        z = nodes(q, 1 if q == 0 else min(self.nodes, _STAGE) if rows > _LONG else self.nodes)
         if q == 0:
             limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
@@ -291,7 +292,7 @@ class Posterior:
         return dict(
             _core.ep_learn(
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
-                learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z, log_proposal,
+                learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z,
                 limits, sites_, was, None if known is None else known.pull,
                 None if known is None else known.precision, chain.outside if limits["condition"] > 0 else None,
             )
@@ -485,20 +486,37 @@ def _named(share: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
 
 
 @functools.lru_cache(maxsize=64)
-def nodes(q: int, count: int) -> tuple[Array, Array]:
-    """Return `count` points (count, q) of a t distribution with 10 degrees of freedom, and their log density (count,).
+def nodes(q: int, count: int) -> Array:
+    """Return `count` standard normal points (count, q), the same for every window.
 
-    They come in pairs z, -z from a fixed seed: the same for every window, and centred.
+    Each stage of them is a piece of one additive recurrence, in pairs z, -z, with the mean 0 and, where there are
+    enough of them, the covariance 1.
     """
     if count == 1 or q == 0:
-        return np.zeros((1, q)), np.zeros(1)
-    freedom = 10
-    rng = np.random.default_rng(20260)
-    half = (count + 1) // 2
-    z = rng.standard_normal((half, q)) * np.sqrt(freedom / rng.chisquare(freedom, half))[:, None]
-    z = np.concatenate([z, -z])[:count]
-    constant = math.lgamma(0.5 * (freedom + q)) - math.lgamma(0.5 * freedom) - 0.5 * q * math.log(freedom * math.pi)
-    return np.ascontiguousarray(z), constant - 0.5 * (freedom + q) * np.log1p((z**2).sum(axis=1) / freedom)
+        return np.zeros((1, q))
+    root = 2.0
+    for _ in range(64):
+        root = (1.0 + root) ** (1.0 / (q + 1))
+    normal = NormalDist()
+    found, at = [], 0
+    for size in _stages(count):
+        half = (size + 1) // 2
+        grid = (0.5 + np.outer(np.arange(at, at + half), root ** -np.arange(1.0, q + 1))) % 1.0
+        at += half
+        z = np.vectorize(normal.inv_cdf)(np.clip(grid, 1e-6, 1 - 1e-6))
+        if half > q:
+            z = np.linalg.solve(np.linalg.cholesky(z.T @ z / half), z.T).T
+        found.append(np.concatenate([z, -z])[:size])
+    return np.ascontiguousarray(np.concatenate(found))
+
+
+def _stages(count: int) -> list[int]:
+    """Return the sizes of the core's stages of so many nodes."""
+    sizes: list[int] = []
+    while count:
+        sizes.append(count if count < 2 * _STAGE or len(sizes) == _STAGES - 1 else _STAGE)
+        count -= sizes[-1]
+    return sizes
 
 
 def _diagonal(part: Gaussian) -> bool:
