@@ -55,7 +55,7 @@ class Problem {
         const InInt group_w = typed<InInt>("group_w"), start = typed<InInt>("start"), group = typed<InInt>("group");
         const InByte kind = typed<InByte>("kind");
         const std::size_t n = m0.size(), rows = kind.size();
-        want(start.size() >= 2 && n >= 1 && n <= static_cast<std::size_t>(hw::ep_states), "start (T+2,), m0 (n,), n <= 16");
+        want(start.size() >= 2 && n >= 1 && n <= std::size_t(hw::ep_states), "start (T+2,), m0 (n,), n <= 16");
         const std::size_t T = start.size() - 2;
         a.T = static_cast<int>(T);
         a.n = static_cast<int>(n);
@@ -217,7 +217,7 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
 
 nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale, In start, In count, bool learn_eps,
                double rate, double start_eps, double power, double beta_a, double beta_b, In z,
-               const nb::dict& limits, std::optional<nb::tuple> sites, std::optional<In> was, std::optional<In> pull,
+               const nb::dict& limits, std::optional<nb::tuple> before, int drop, int shaped, std::optional<In> pull,
                std::optional<In> precision, std::optional<nb::dict> outside) {
     want(z.ndim() == 2 && z.shape(0) >= 1, "z (nodes, q)");
     const std::size_t nodes = z.shape(0), abreast = (nodes + hw::ep_abreast - 1) / hw::ep_abreast * hw::ep_abreast;
@@ -231,15 +231,13 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
              start.size() == groups && count.size() == groups, "one entry a half-width");
     std::size_t q = learn_eps ? 1 : 0;
     for (std::size_t g = 0; g < groups; g++) q += free.data()[g] ? 1 : 0;
-    want(q <= 16, "at most 16 free parameters");
+    want(q <= std::size_t(hw::ep_free), "at most 16 free parameters");
     want(z.shape(1) == q, "z (nodes, q)");
     l.free = free.data();
     l.floor = floor.data();
     l.cap = cap.data();
     l.scale = scale.data();
     l.start = start.data();
-    l.was = was ? was->data() : start.data();
-    want(!was || was->size() == groups, "was (groups,)");
     l.count = count.data();
     want(pull.has_value() == precision.has_value(), "pull and precision go together");
     if (pull) {
@@ -264,6 +262,7 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     l.tol = real("tol");
     l.tol_nodes = real("tol_nodes");
     l.close = real("close");
+    l.near = real("near");
     l.least = real("least");
     l.stage = whole("stage");
     l.enough = real("enough");
@@ -274,7 +273,28 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     l.condition = real("condition");
     a.damping = real("damping");
     nb::dict found;
-    found["sites"] = p.sites(sites, 1);
+    found["sites"] = p.sites(std::nullopt, 1);
+    hw::EpBefore old{};
+    InInt old_start;
+    In old_sites[4];
+    if (before) {
+        want(before->size() == 5 && drop >= 0, "before: (start, m, D, tau, nu)");
+        old_start = nb::cast<InInt>((*before)[0]);
+        want(old_start.size() >= 2, "before: start");
+        old.stages = static_cast<int>(old_start.size()) - 1;
+        old.drop = drop;
+        old.start = old_start.data();
+        for (int t = 0; t < old.stages; t++) want(old.start[t] >= 0 && old.start[t] <= old.start[t + 1], "before: start");
+        const double** into[4] = {&old.m, &old.D, &old.tau, &old.nu};
+        for (int k = 0; k < 4; k++) {
+            old_sites[k] = nb::cast<In>((*before)[k + 1]);
+            want(old_sites[k].size() == (k < 2 ? old.stages * n : std::size_t(old.start[old.stages])), "before: sites");
+            *into[k] = old_sites[k].data();
+        }
+        l.before = &old;
+    }
+    want(shaped >= 0, "shaped: a stage");
+    l.shaped = shaped;
     const bool outliers = learn_eps || rate > 0.0;
     double* of_lanes[5];
     nb::object held[5] = {fresh({abreast, stages, n}, of_lanes), fresh({abreast, stages, n, n}, of_lanes + 1),
@@ -308,6 +328,17 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     nb::object centre = fresh({stages, n}, &l.centre);
     found["out"] = nb::none();
     if (outliers) found["out"] = fresh({rows}, &l.out);
+    found["mean"] = fresh({groups}, &l.mean, floor.data());
+    found["sd"] = fresh({groups}, &l.sd);
+    found["lo"] = fresh({groups}, &l.quantile_lo, floor.data());
+    found["hi"] = fresh({groups}, &l.quantile_hi, floor.data());
+    found["told_pull"] = fresh({groups}, &l.told_pull);
+    found["told_precision"] = fresh({groups, groups}, &l.told_precision);
+    found["edge_x"] = fresh({stages, n}, &l.edge_x);
+    found["edge_P"] = fresh({stages, n, n}, &l.edge_P);
+    double found_rate = 0.0, effective = 0.0;
+    l.found_rate = &found_rate;
+    l.effective = &effective;
     double log_evidence = 0.0, log_prior = 0.0, log_mode = 0.0, residual = 0.0;
     std::int32_t used = 0;
     long sweeps = 0;
@@ -326,6 +357,9 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
         code = HW_PICK_WIDE(ep_learn)(l);
     }
     found["code"] = code;
+    found["effective"] = effective;
+    found["rate"] = nb::none();
+    if (learn_eps) found["rate"] = found_rate;
     found["log_evidence"] = log_evidence;
     found["log_prior"] = log_prior;
     found["log_mode"] = log_mode;
@@ -335,14 +369,26 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     return found;
 }
 
+nb::tuple known(InBool free, In pull, In precision) {
+    const std::size_t p = free.size();
+    want(pull.size() == p && precision.size() == p * p, "pull (p,), precision (p,p)");
+    double *h = nullptr, *H = nullptr;
+    nb::object found_h = fresh({p}, &h), found_H = fresh({p, p}, &H);
+    Work work(4 * p * (p + 1));
+    HW_PICK_WIDE(ep_known_part)(static_cast<int>(p), free.data(), pull.data(), precision.data(), h, H, work.p);
+    return nb::make_tuple(found_h, found_H);
+}
+
 }  // namespace
 
 void bind_ep(nb::module_& mod) {
     mod.def("ep_run", &run, "problem"_a, "s"_a, "eps"_a, "sweeps"_a, "tol"_a, "damping"_a, "sites"_a.none(),
             "Expectation propagation on a chain for given half-widths, one set a member; see core/ep_entry.hpp.");
+    mod.def("ep_known", &known, "free"_a, "pull"_a, "precision"_a,
+            "What is known of the free half-widths alone, whatever the others are; see core/ep_handover.hpp.");
     mod.def("ep_learn", &learn, "problem"_a, "free"_a, "floor"_a, "cap"_a, "scale"_a, "start"_a, "count"_a, "learn_eps"_a,
             "rate"_a, "start_eps"_a, "power"_a, "beta_a"_a, "beta_b"_a, "z"_a, "limits"_a,
-            "sites"_a.none(), "was"_a.none(), "pull"_a.none() = nb::none(), "precision"_a.none() = nb::none(),
+            "before"_a.none() = nb::none(), "drop"_a = 0, "shaped"_a = 0, "pull"_a.none() = nb::none(), "precision"_a.none() = nb::none(),
             "outside"_a.none() = nb::none(),
             "The same with half-widths found by evidence and what is not known of them carried into the answer.");
 }

@@ -1,5 +1,6 @@
 // Entry points of core/ep.hpp.
 #include "ep.hpp"
+#include "ep_handover.hpp"
 #include "ep_learn.hpp"
 
 namespace hw {
@@ -155,14 +156,9 @@ int ep_run(const EpArgs& a) {
     }
 }
 
-std::size_t ep_learn_workspace(const EpLearnArgs& a) {
-    const std::size_t sites = std::size_t(a.base.T + 1) * a.base.n + a.base.rows;
-    const std::size_t own = ep_workspace(a.base) + 2 * sites * (1 + learner_parameters(a));
-    return a.outside ? own + wide_lanes + ep_workspace(*a.outside) : own;
-}
+namespace {
 
-int ep_learn(const EpLearnArgs& a) {
-    const FlushTiny flush;
+int learn_any(const EpLearnArgs& a) {
     switch (a.base.n) {
 #ifndef HW_FEW_SIZES
         case 1: return learn(Dim<1>(), a);
@@ -172,6 +168,50 @@ int ep_learn(const EpLearnArgs& a) {
         case 3: return learn(Dim<3>(), a);
         default: return learn(Dim<0>(a.base.n), a);
     }
+}
+
+// numbers that taking over and handing on need, in whole registers
+std::size_t handover_size(const EpLearnArgs& a) {
+    const std::size_t p = a.base.groups, n = a.base.n;
+    const std::size_t size = 5 * p * (p + 1) + a.nodes * (2 * learner_parameters(a) + 2) + 4 * n * n + 2 * n;
+    return (size + wide_lanes - 1) / wide_lanes * wide_lanes;
+}
+
+}  // namespace
+
+std::size_t ep_learn_workspace(const EpLearnArgs& a) {
+    const std::size_t sites = std::size_t(a.base.T + 1) * a.base.n + a.base.rows;
+    const std::size_t own = handover_size(a) + ep_workspace(a.base) + 2 * sites * (1 + learner_parameters(a));
+    return a.outside ? own + wide_lanes + ep_workspace(*a.outside) : own;
+}
+
+void ep_known_part(int p, const bool* free, const double* pull, const double* precision, double* found_pull,
+                   double* found_precision, double* work) {
+    ep_known(p, free, pull, precision, found_pull, found_precision, work);
+}
+
+int ep_learn(const EpLearnArgs& given) {
+    const FlushTiny flush;
+    EpLearnArgs a = given;
+    double* const work = a.base.work;
+    a.base.work += handover_size(a);
+    const int p = a.base.groups;
+    double* rest = work;
+    if (a.pull) {
+        rest = work + p * (p + 1);
+        ep_known(p, a.free, given.pull, given.precision, work, work + p, rest);
+        a.pull = work;
+        a.precision = work + p;
+    }
+    a.base.warm = a.before && ep_moved(a);
+    if (a.base.warm) a.close = a.near;
+    const int code = learn_any(a);
+    if (code >= 2) return code;
+    const int q = static_cast<int>(learner_parameters(a));
+    ep_widths(a, q, rest);
+    ep_told(a, q, rest);
+    ep_edge(a.base, a.base.m, a.base.D, a.base.tau, a.base.nu, a.edge_x, a.edge_P, rest);
+    return code;
 }
 
 }  // namespace HW_ISA

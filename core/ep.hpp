@@ -709,9 +709,9 @@ struct Ep {
 
     // Third and fourth cumulants of the states, to first order in what the sites leave out: a factor whose tilted
     // distribution has the cumulant k_r adds (Cov(x, z) / Var(z))^r k_r. Factors more than `ep_reach` rows away count as
-    // Gaussian: they add with the r-th power of a small correlation.
-    void shapes(double* k3, double* k4) const {
-        for (int t = 0; t <= a.T; t++) {
+    // Gaussian: they add with the r-th power of a small correlation. Of the stages from `first` on.
+    void shapes(double* k3, double* k4, int first = 0) const {
+        for (int t = first; t <= a.T; t++) {
             V c3[cap], c4[cap], R[cap * cap], M[cap * cap];
             for (int i = 0; i < n; i++) c3[i] = c4[i] = V(0.0);
             const V* S = cross.S + t * n * n;

@@ -11,6 +11,7 @@ namespace hw {
 
 constexpr int ep_truncation = noise_kinds;  // a row that keeps its residual in [lo, hi]: bounds, half-spaces
 constexpr int ep_states = 16;               // most states
+constexpr int ep_free = 16;                 // most free parameters
 constexpr int ep_abreast = 8;               // most members in one register
 
 // Matrices over time: one, one a row, or an index a row; the same for all members or one stack each.
@@ -57,15 +58,24 @@ struct EpArgs {
     double* work;                  // ep_workspace doubles, on a 32-byte boundary
 };
 
-// Half-widths and the rate of outliers found by evidence; see core/ep_learn.hpp. `base` has a member for each node, up to a multiple of
-// `ep_abreast` (its m, D, tau, nu hold one: the mode's, on the way in too if it is warm).
+// Sites of the window before; see core/ep_handover.hpp.
+struct EpBefore {
+    int stages, drop;                 // of it; how many rows later the new one begins
+    const std::int32_t* start;        // (stages+1,)
+    const double *m, *D, *tau, *nu;   // (stages,n), (start[stages],)
+};
+
+// Half-widths and the rate of outliers found by evidence; see core/ep_learn.hpp. `base` has a member for each node, up to a
+// multiple of `ep_abreast` (its m, D, tau, nu hold one: the mode's).
 struct EpLearnArgs {
     EpArgs base;
     const EpArgs* outside;                   // the chain with its bounds alone, or null
     double condition;                        // power of its evidence that the chain's is divided by
     const bool* free;                        // (groups,)
     const double *floor, *cap, *scale;       // (groups,): bounds, and the order of size
-    const double *start, *was;               // (groups,): first guess; half-widths of warm sites
+    const double* start;                     // (groups,): first guess, and the half-widths that `before` belongs to
+    const EpBefore* before;                  // sites to start from; or null
+    int shaped;                              // first stage whose skewness and kurtosis are asked for
     const double* count;                     // (groups,): rows of each
     bool learn_eps;
     double rate, start_eps;                  // the rate where it is known; logit of the first guess
@@ -73,7 +83,7 @@ struct EpLearnArgs {
     double beta_a, beta_b;                   // prior of the rate
     const double *pull, *precision;          // (groups,), (groups,groups): what is known already, in u = s^warp; or null
     int steps, few, many, most;              // Newton steps; sweeps of a step, of the first one, of a node
-    double tol, tol_nodes, close, least, narrow;
+    double tol, tol_nodes, close, near, least, narrow;  // near: the distance of the mode that does where sites are warm
     int nodes, stage;                        // at most so many points, so many a stage
     double usable;                           // disagreement of moments from which a point counts as not settled
     double enough;                           // doubt about the states, in standard deviations, that ends the stages
@@ -86,6 +96,10 @@ struct EpLearnArgs {
     double *log_evidence, *log_mode, *log_prior, *residual;  // of the data; Z times prior, and the prior, at the mode
     std::int32_t* used;                      // nodes
     long* sweeps_used;
+    double *mean, *sd, *quantile_lo, *quantile_hi;           // (groups,), only the free ones written: half-widths
+    double *found_rate, *effective;                          // rate of outliers; effective number of nodes
+    double *told_pull, *told_precision;                      // (groups,), (groups,groups): what the rows tell
+    double *edge_x, *edge_P;                                 // (T+1,n), (T+1,n,n): x_t given what lies up to t
 };
 
 }  // namespace hw
@@ -94,3 +108,4 @@ HW_WIDE_KERNEL(std::size_t, ep_workspace, const hw::EpArgs& args)
 HW_WIDE_KERNEL(int, ep_run, const hw::EpArgs& args)
 HW_WIDE_KERNEL(std::size_t, ep_learn_workspace, const hw::EpLearnArgs& args)
 HW_WIDE_KERNEL(int, ep_learn, const hw::EpLearnArgs& args)
+HW_WIDE_KERNEL(void, ep_known_part, int p, const bool* free, const double* pull, const double* precision, double* found_pull, double* found_precision, double* work)

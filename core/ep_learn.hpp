@@ -24,7 +24,6 @@
 namespace hw {
 namespace HW_ISA {
 
-constexpr int ep_free = 16;   // most free parameters
 constexpr int ep_alone = 10;  // sweeps of a chain with its bounds alone, which starts afresh
 constexpr int ep_stages = 8;  // most stages of points
 constexpr double ep_lean = 4.0;  // points that a first guess of their covariance is worth
@@ -565,7 +564,7 @@ struct EpLearner {
         if (outside) outside->block = ep.block;
         recall(at);
         evaluate_inside(at, a.most, a.tol_nodes, value, slope, false);
-        ep.shapes(a.base.k3, a.base.k4);
+        ep.shapes(a.base.k3, a.base.k4, a.shaped);
         const V more = ep.second();
         for (int l = 0; l < wide_lanes && k + l < end; l++) {
             for (int j = 0; j < q; j++) {
@@ -605,7 +604,7 @@ struct EpLearner {
                 keep_tau[k] = b.tau[k];
                 keep_nu[k] = b.nu[k];
             }
-            for (int j = 0; j < q; j++) from[j] = group[j] >= 0 ? std::log(max2(a.was[group[j]], 1e-300)) : phi[j];
+            for (int j = 0; j < q; j++) from[j] = group[j] >= 0 ? std::log(max2(a.start[group[j]], 1e-300)) : phi[j];
             keep(from);
         }
         const EpCross wanted = ep.cross;

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 import halfwidth as hw
-from halfwidth.methods._carry import Carried, Known, inside, messages, told
+import halfwidth._core as _core
+from halfwidth.methods._carry import WARP, Carried, Known, Start, inside
 from halfwidth.methods._sites import sites
+from tests import naive_carry
 
 A = np.array([[1, -0.5, 0.2], [0.5, 0.1, 0], [0.3, 0, -0.1]])
 C = np.array([[1, 0, 0.5], [0, 1, 0.5]])
@@ -45,7 +47,7 @@ def test_messages_with_matrices_that_vary_and_correlate():
         hw.Normal(np.zeros(3), 1.0), E=E,
     )  # fmt: skip
     answer = hw.Posterior().answer(model, record)
-    found = messages(answer.chain, answer.found["sites"], 12)
+    found = list(zip(answer.found["edge_x"], answer.found["edge_P"], strict=True))
     kf = hw.estimate(model, record, hw.KalmanFilter())
     np.testing.assert_allclose([x for x, _ in found[1:]], kf.x, atol=1e-9)
     np.testing.assert_allclose([P for _, P in found[1:]], kf.P, atol=1e-9)
@@ -55,14 +57,13 @@ def test_what_a_window_tells_is_the_slope_of_its_evidence():
     _, record = drawn(400, 4)
     # 64 nodes in five dimensions leave a slope 0.2 to 0.3 of error over this step, more than log Z's own bend
     answer = hw.Posterior(nodes=256).answer(system(UNKNOWN, UNKNOWN), record)
-    known = told(answer)
+    known = answer.told
     chain = sites(system(UNKNOWN, UNKNOWN), record)
     s = answer.start.s
 
     def evidence(s):
-        import halfwidth._core as _core
-
-        return _core.ep_run(chain.problem, s[None].copy(), np.zeros(1), 200, 1e-8, 1.0, None)["log_z"][0]
+        found = _core.ep_run(chain.problem, s[None].copy(), np.zeros(1), 200, 1e-8, 1.0, None)
+        return found["log_z"][0] + found["second"][0]
 
     at = np.sqrt(s)
     for direction in np.eye(5):
@@ -76,7 +77,7 @@ def test_knowing_half_of_the_rows_is_as_good_as_having_them():
     _, record = drawn(240, 5)
     first, second = (hw.Record(record.t[k], record.y[k]) for k in (slice(0, 120), slice(120, 240)))
     model = system(UNKNOWN, UNKNOWN)
-    known = told(hw.Posterior().answer(model, first))
+    known = hw.Posterior().answer(model, first).told
     answer = hw.Posterior().answer(model, second, known=known)
     both, alone = (hw.estimate(model, r, hw.Posterior()).info["half_widths"] for r in (record, second))
     carried = answer.estimate.info["half_widths"]
@@ -119,10 +120,64 @@ def test_no_row_speaks_twice():
 def test_of_marginalises_and_keeps_what_is_proper():
     H = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, -1.0]])
     known = Known(np.array([1.0, 2.0, 3.0]), H)
-    part = known.of(np.array([True, False, True]))
+    part = Known(*_core.ep_known(np.array([True, False, True]), known.pull, known.precision))
     assert part.precision[0, 0] == pytest.approx(4 - 1 / 2)
     assert part.pull[0] == pytest.approx(1 - 2 / 2)
     assert part.precision[2, 2] == part.pull[2] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_known_of_the_free_ones_equals_the_twin(seed):
+    rng = np.random.default_rng(seed)
+    p = [1, 2, 5, 7, 18, 5][seed]
+    root = rng.standard_normal((p, max(p - 1, 1)))
+    H = (root @ root.T + 0.1 * (rng.random((p, p)) - 0.5)) * 10.0 ** rng.integers(-3, 4, (p, 1))
+    H = 0.5 * (H + H.T)
+    free = rng.random(p) < 0.6
+    if seed == 5:
+        H, free = np.zeros((p, p)), np.ones(p, dtype=bool)
+    pull = rng.standard_normal(p)
+    for ours, twin in zip(_core.ep_known(free, pull, H), naive_carry.known(free, pull, H), strict=True):
+        np.testing.assert_allclose(ours, twin, rtol=1e-9, atol=1e-9 * max(np.abs(twin).max(), 1e-9))
+
+
+@pytest.mark.parametrize("nodes", [1, 7, 40])
+def test_what_a_window_hands_on_equals_the_twin(nodes):
+    _, record = drawn(14, 3)
+    y = record.y.copy()
+    y[3] = y[7:9, 0] = np.nan
+    F, E = np.array([[1, 0.4], [0, 1]]), np.array([[1, 0.3, 0.1], [0, 1, 0.2], [0, 0, 1]])
+    model = system(UNKNOWN, UNKNOWN, bounds=BOX, F=F, E=E)
+    known = Known(np.full(5, 0.3), np.eye(5) + 0.2)
+    found = (answer := hw.Posterior(nodes=nodes).answer(model, hw.Record(record.t, y), known=known)).found
+    free = answer.chain.free
+    for ours, twin in zip(answer.told, naive_carry.told(free, found, WARP, known.precision), strict=True):
+        np.testing.assert_allclose(ours, twin, rtol=1e-8, atol=1e-8 * np.abs(twin).max())
+    *widths, effective = naive_carry.widths(free, found)
+    for name, twin in zip(("mean", "sd", "lo", "hi"), widths, strict=True):
+        np.testing.assert_allclose(found[name][free], twin, rtol=1e-10)
+    assert found["effective"] == pytest.approx(effective, rel=1e-10)
+    x, P = naive_carry.edge(answer.chain.problem, found["sites"])
+    np.testing.assert_allclose(found["edge_x"], x, atol=1e-11)
+    np.testing.assert_allclose(found["edge_P"], P, atol=1e-11)
+
+
+def test_sites_go_along_with_their_rows():
+    _, record = drawn(20, 4)
+    model = system(UNKNOWN, UNKNOWN, bounds=BOX)
+
+    def window(first, stop, start=None, drop=0):
+        part = hw.Record(record.t[first:stop], record.y[first:stop])
+        return hw.Posterior(nodes=1).answer(model, part, start=start, drop=drop)
+
+    old = window(0, 14)
+    again = window(0, 14, old.start)
+    assert again.found["sweeps"] < old.found["sweeps"]
+    np.testing.assert_allclose(again.estimate.x, old.estimate.x, atol=0.02)
+    for first, stop in ((0, 15), (1, 15), (5, 15), (0, 18), (5, 14), (13, 15), (14, 20)):
+        warm, cold = window(first, stop, old.start, first), window(first, stop, Start(old.start.s))
+        np.testing.assert_allclose(warm.estimate.x, cold.estimate.x, atol=0.02)
+        assert warm.estimate.status.good
 
 
 def test_a_snapshot_holds_what_is_carried():

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.methods._sites import CONTAMINATED, Sites
+from halfwidth.methods._sites import Frame, Sites
 from halfwidth.spread import Normal
 
 if TYPE_CHECKING:
@@ -72,68 +72,6 @@ class Known(NamedTuple):
         """Return it weighted."""
         return Known(weight * self.pull, weight * self.precision)
 
-    def of(self, free: NDArray[np.bool_]) -> "Known":
-        """Return what is known of the free ones alone, whatever the others are, as a proper Gaussian."""
-        f, rest = np.flatnonzero(free), np.flatnonzero(~free)
-        H, h = self.precision[np.ix_(f, f)], self.pull[f]
-        if rest.size and self.precision[rest].any():
-            gain = self.precision[np.ix_(f, rest)] @ np.linalg.pinv(self.precision[np.ix_(rest, rest)], hermitian=True)
-            H, h = H - gain @ self.precision[np.ix_(rest, f)], h - gain @ self.pull[rest]
-        found = Known.none(len(free))
-        value, vector = np.linalg.eigh(H / (unit := _unit(H)) / unit[:, None])
-        keep = value > 0  # a direction that only curves the other way says nothing
-        basis = vector[:, keep] * unit[:, None]
-        found.precision[np.ix_(f, f)] = (basis * value[keep]) @ basis.T
-        found.pull[f] = basis @ (vector[:, keep].T @ (h / unit))
-        return found
-
-
-def _unit(H: Array) -> Array:
-    """Return a scale of each coordinate, so that eigenvalues compare."""
-    d = np.sqrt(np.abs(np.diagonal(H)))
-    return np.where(d > 0, d, 1.0)
-
-
-def told(answer: "Answer") -> Known:
-    """Return what the rows of one window tell of its half-widths."""
-    chain, found = answer.chain, answer.found
-    free = np.flatnonzero(chain.free)
-    q, K = free.size, int(found["nodes"])
-    known = Known.none(len(chain.free))
-    if not q:
-        return known
-    log_weight = found["log_weight"][:K]
-    phi, slope = found["phi"][:K, :q], found["slope"][:K, :q]
-    u = np.exp(WARP * phi)
-    g = slope / (WARP * u)
-    if K == 1:
-        H = found["H"][:q, :q] / (WARP**2 * u[0][:, None] * u[0])
-        if answer.known is not None:
-            H = H - answer.known.precision[np.ix_(free, free)]
-        pull = g[0] + H @ u[0]
-    else:
-        sound = np.isfinite(log_weight) & np.isfinite(g).all(axis=1)
-        u, g, log_weight, second = u[sound], g[sound], log_weight[sound], found["second"][:K][sound]
-        if len(u) < q + 2:
-            return known
-        for flat in (1.0, 0.5, 0.25, 0.0):  # few nodes carry the weight: they alone cannot tell a slope
-            w = np.exp(flat * (log_weight - log_weight.max()))
-            w /= w.sum()
-            if 1.0 / (w @ w) > 2 * q + 2:
-                break
-        mean, level = w @ u, w @ g
-        du, dg = u - mean, g - level
-        S = (w[:, None] * du).T @ du
-        S[np.diag_indices(q)] *= 1.0 + 1e-6
-        H = -np.linalg.solve(S, (w[:, None] * du).T @ dg)
-        H = 0.5 * (H + H.T)
-        # what log Z lacks has no slope of its own: that of a line through the nodes
-        pull = level + np.linalg.solve(S, du.T @ (w * second)) + H @ mean
-    if np.isfinite(H).all() and np.isfinite(pull).all():
-        known.precision[np.ix_(free, free)] = H
-        known.pull[free] = pull
-    return known
-
 
 def inside(chain: Sites, s: Array) -> Known:
     """Return the logarithm of the evidence of the bounds alone, to second order about half-widths s (p,)."""
@@ -158,72 +96,15 @@ def inside(chain: Sites, s: Array) -> Known:
     return known
 
 
-def messages(chain: Sites, sites: tuple[Array, ...], stages: int) -> list[tuple[Array, Array]]:
-    """Return mean and covariance of x_0 .. x_stages, each given what lies up to it, by the sites of a solved chain."""
-    p = chain.problem
-    n = len(p["m0"])
-    m, D = (np.asarray(v).reshape(-1, n) for v in sites[:2])
-    tau, nu = (np.ravel(v) for v in sites[2:])
+class Start(NamedTuple):
+    """Where a search may start: half-widths (p,), and the sites of a solved chain that belong to them.
 
-    def at(name: str, t: int) -> Any:
-        stack = p.get(name)
-        if stack is None:
-            return None
-        index = p.get(f"{name}_index")
-        return stack[index[t] if index is not None else t if len(stack) > 1 else 0]
-
-    x, P = p["m0"] + m[0], p["P0"] + np.diag(D[0])
-    found = []
-    for t in range(stages + 1):
-        if t:
-            A, G, Q = at("A", t - 1), at("G", t - 1), at("Q", t - 1)
-            x = A @ x + p["b"][t - 1] + (m[t] if G is None else G @ m[t])
-            P = A @ P @ A.T + (np.diag(D[t]) if G is None else (G * D[t]) @ G.T)
-            if Q is not None:
-                P = P + Q
-        for k in range(int(p["start"][t]), int(p["start"][t + 1])):
-            h = p["h"][k]
-            Ph = P @ h
-            left = 1.0 + tau[k] * float(h @ Ph)
-            if left > 1e-9:
-                x = x + Ph * ((nu[k] - tau[k] * float(h @ x - p["y"][k])) / left)
-                P = P - np.outer(Ph, Ph) * (tau[k] / left)
-        found.append((x, 0.5 * (P + P.T)))
-    return found
-
-
-class Warm(NamedTuple):
-    """Sites of a solved window: half-widths (p,), first row of each stage (T + 2,), (m, D, tau, nu) of `Sites`."""
+    These are the first row of each of its stages (T + 2,), m and D of its noise, tau and nu of its rows (`EpBefore` in
+    core/ep_entry.hpp).
+    """
 
     s: Array
-    start: Array
-    sites: tuple[Array, ...]
-
-    def moved(self, chain: Sites, a: int) -> tuple[Array, Array, Array, Array] | None:
-        """Return sites of the chain that begins `a` rows later: its new ones are the Gaussians of their variances.
-
-        None where the two do not hold the same rows in common.
-        """
-        p = chain.problem
-        n, start = len(p["m0"]), p["start"]
-        m_, D_ = (v.reshape(-1, n) for v in self.sites[:2])
-        tau_, nu_ = (np.ravel(v) for v in self.sites[2:])
-        common, stages = len(m_) - 1 - a, len(start) - 1
-        if common < 1 or common + 1 > stages:
-            return None
-        here, there = slice(start[1], start[common + 1]), slice(self.start[a + 1], self.start[-1])
-        if here.stop - here.start != there.stop - there.start:
-            return None
-        m, D = np.zeros((1, stages, n)), np.empty((1, stages, n))
-        D[0, 0] = p["half0"] ** 2 / 3.0
-        D[0, 1:] = np.where(p["group_w"] >= 0, self.s[p["group_w"]] ** 2 / 3.0, 0.0)
-        m[0, 1 : common + 1], D[0, 1 : common + 1] = m_[1 + a :], D_[1 + a :]
-        kind, R = p["kind"], p["R"]
-        box = np.where(p["group"] >= 0, self.s[p["group"]], 0.0)
-        tau = np.where(kind < CONTAMINATED, 1.0 / np.maximum(box**2 / 3.0 + R, 1e-300), 0.0)[None]
-        nu = np.zeros((1, len(kind)))
-        tau[0, here], nu[0, here] = tau_[there], nu_[there]
-        return m, D, tau, nu
+    before: tuple[Array, ...] | None = None
 
 
 class Carried:
@@ -238,10 +119,10 @@ class Carried:
 
     Attributes
     ----------
-    s : (p,) array or None
-        Half-widths at the mode of the newest window.
-    warm : Warm or None
-        Its sites.
+    start : Start or None
+        Half-widths at the mode of the newest window, and its sites.
+    frames : dict
+        What windows with the same outputs seen have in common.
     """
 
     def __init__(self, p: int, rows: float) -> None:
@@ -250,20 +131,20 @@ class Carried:
         self.rows = 0.0  # rows that have left, faded
         self.waiting: list[tuple[int, Known, Known]] = []  # newest row of a window, and both, weighted
         self.inside = Known.none(p)  # bounds alone of the last window asked
-        self.s: Array | None = None
         self.count = 0  # windows that told something
-        self.warm: Warm | None = None
+        self.start: Start | None = None
         self.first: Normal | None = None  # the state before the first row, once rows have left
-        self._edge: list[tuple[Array, Array]] | None = None  # messages of the newest window's stages ...
-        self._newest: Answer | None = None  # ... or what they are made of
+        self.frames: dict[bytes, Frame] = {}
+        self._edge: tuple[Array, Array] | None = None  # mean and covariance of the newest window's stages, each given
+        # what lies up to it: the forwards message of expectation propagation
 
     def known(self, first: int, rows: int) -> Known | None:
         """Return what the windows tell that have no row from `first` on, for one of so many rows; None: nothing."""
         self.gone, self.kept_in = self.gone.times(self.fade), self.kept_in.times(self.fade)
         self.rows *= self.fade
         while self.waiting and self.waiting[0][0] < first:
-            _, told_, inside_ = self.waiting.pop(0)
-            self.gone, self.kept_in = self.gone.plus(told_), self.kept_in.plus(inside_)
+            _, told, kept_in = self.waiting.pop(0)
+            self.gone, self.kept_in = self.gone.plus(told), self.kept_in.plus(kept_in)
             self.rows += 1.0
         if not self.rows:
             return None
@@ -274,61 +155,65 @@ class Carried:
         self.first = self._state(a) if a else self.first
 
     def _state(self, a: int) -> Normal | None:
-        if self._edge is None and self._newest is not None:
-            self._edge = messages(self._newest.chain, self._newest.found["sites"], a)
-        if self._edge is None or len(self._edge) <= a:
+        if self._edge is None or len(self._edge[0]) <= a:
             return None
-        x, P = self._edge[a]
-        d = np.diagonal(P)
+        x, P = self._edge[0][a], self._edge[1][a]
+        d = P.diagonal()
         if not (np.isfinite(x).all() and np.isfinite(P).all() and (d > 0).all()):
             return None
-        return Normal.of(x, P + np.diag(1e-12 * d))
+        P = P.copy()
+        P.flat[:: len(x) + 1] += 1e-12 * d
+        return Normal.of(x, P)
 
     def take(self, answer: "Answer", newest: int, rows: int, *, counts: bool) -> None:
         """Keep what a window told: its newest row's number, its number of rows, and whether it told anything new."""
-        self._edge, self._newest, self.warm = None, None, None
         if not answer.estimate.status.good:
+            self._edge = None
+            self.start = None if self.start is None else Start(self.start.s)
             return
-        self.s, self._newest = answer.start.s, answer
-        self.warm = Warm(self.s, answer.chain.problem["start"], answer.found["sites"])
+        self.start = answer.start
+        self._edge = answer.found["edge_x"], answer.found["edge_P"]
         if not counts:
             return
         if self.count % rows == 0:
-            self.inside = inside(answer.chain, self.s)
+            self.inside = inside(answer.chain, self.start.s)
         self.count += 1
-        self.waiting.append((newest, told(answer).times(1.0 / rows), self.inside.times(1.0 / rows)))
+        self.waiting.append((newest, answer.told.times(1.0 / rows), self.inside.times(1.0 / rows)))
 
     def save(self) -> dict[str, Any]:
         """Return all of it as plain numbers."""
-        edge = self._edge
-        if self._newest is not None:
-            stages = len(self._newest.chain.problem["start"]) - 2
-            edge = messages(self._newest.chain, self._newest.found["sites"], stages)
+        start = self.start
         return {
-            "gone": [v.tolist() for v in self.gone],
-            "waiting": [[k, known.pull.tolist(), known.precision.tolist()] for k, known in self.waiting],
+            "gone": [_plain(self.gone), _plain(self.kept_in), _plain(self.inside), self.rows],
+            "waiting": [[k, _plain(told), _plain(inside)] for k, told, inside in self.waiting],
             "count": self.count,
-            "s": None if self.s is None else self.s.tolist(),
-            "warm": None
-            if self.warm is None
-            else [self.warm.start.tolist(), [np.ravel(v).tolist() for v in self.warm.sites]],
+            "s": None if start is None else start.s.tolist(),
+            "before": None if start is None or start.before is None else [np.ravel(v).tolist() for v in start.before],
             "first": None if self.first is None else [self.first.mean.tolist(), self.first.P.tolist()],
-            "edge": None if edge is None else [[x.tolist(), P.tolist()] for x, P in edge],
+            "edge": None if self._edge is None else [v.tolist() for v in self._edge],
         }
 
     def load(self, saved: dict[str, Any]) -> None:
         """Take up what `save` returned."""
-        self.gone = Known(*(np.array(v, dtype=float) for v in saved["gone"]))
-        self.waiting = [
-            (int(k), Known(np.array(h, dtype=float), np.array(H, dtype=float))) for k, h, H in saved["waiting"]
-        ]
+        *sums, rows = saved["gone"]
+        self.gone, self.kept_in, self.inside = (_known(v) for v in sums)
+        self.rows = float(rows)
+        self.waiting = [(int(k), _known(told), _known(inside)) for k, told, inside in saved["waiting"]]
         self.count = int(saved["count"])
-        self.s = None if saved["s"] is None else np.array(saved["s"], dtype=float)
-        self.warm = None
-        if saved["warm"] is not None and self.s is not None:
-            start, sites = saved["warm"]
-            self.warm = Warm(self.s, np.array(start, dtype=int), tuple(np.array(v, dtype=float) for v in sites))
+        self.start = None
+        if saved["s"] is not None:
+            before = saved["before"]
+            if before is not None:
+                before = (np.array(before[0], dtype=np.int32), *(np.array(v, dtype=float) for v in before[1:]))
+            self.start = Start(np.array(saved["s"], dtype=float), before)
         first, edge = saved["first"], saved["edge"]
         self.first = None if first is None else Normal(*first)
-        self._newest = None
-        self._edge = None if edge is None else [(np.array(x, dtype=float), np.array(P, dtype=float)) for x, P in edge]
+        self._edge = None if edge is None else (np.array(edge[0], dtype=float), np.array(edge[1], dtype=float))
+
+
+def _plain(known: Known) -> list[Any]:
+    return [v.tolist() for v in known]
+
+
+def _known(saved: list[Any]) -> Known:
+    return Known(*(np.array(v, dtype=float) for v in saved))

@@ -18,7 +18,8 @@ from halfwidth.result import Estimate, Status
 from halfwidth.spread import Shaped
 
 if TYPE_CHECKING:
-    from halfwidth.methods.posterior import Answer, Posterior, Start
+    from halfwidth.methods._carry import Start
+    from halfwidth.methods.posterior import Answer, Posterior
 
 _STEPS = 40
 _NODES = 24

@@ -245,11 +245,11 @@ def first_scales(model: Linear, seen: Sequence[Array]) -> Array:
     nx, ny = model.nx, model.ny
     sigma = np.ones(nx + ny)
     for j, y in enumerate(seen):
-        step = np.abs(np.diff(y))
-        for level in (np.mean(step) if step.size else 0.0, np.std(y) if y.size else 0.0):
-            if level > 0:
-                sigma[nx + j] = level
-                break
+        level = np.abs(y[1:] - y[:-1]).sum() / max(len(y) - 1, 1)
+        if not level > 0 and len(y):
+            level = np.std(y)
+        if level > 0:
+            sigma[nx + j] = level
 
     def typical(matrix: Varying | None, n: int) -> Array:
         if matrix is None:

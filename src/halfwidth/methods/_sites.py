@@ -5,6 +5,7 @@ its seen outputs, ``h'x - y = e``, and the bounds. An unseen output that a seen 
 eliminated, and its half-width counts as variance of that row (as in `_residuals`).
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,16 +74,89 @@ class Sites:
         )
 
 
-def sites(model: Linear, record: Record, *, outliers: bool = False) -> Sites:
-    """Build the chain of a model without unknown entries."""
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What the chains of one model have in common in all windows of the same rows seen.
+
+    Parameters
+    ----------
+    problem : dict
+        The entries of `Sites.problem` that no data are in.
+    B : (nx, nu) array or None
+        Inputs to what is added to the state; None: as the rows of the record have it.
+    Y : (K, ny) array
+        Seen outputs of its row to the target of each row of the chain.
+    R : (ny,) array
+        Variances of Gaussian outputs; infinite where the noise has a bounded part.
+    """
+
+    problem: dict[str, Any]
+    free: NDArray[np.bool_]
+    floor: Array
+    cap: Array
+    count: Array
+    uniform: NDArray[np.bool_]
+    row: NDArray[np.intp]
+    output: NDArray[np.intp]
+    B: Array | None
+    Y: Array
+    R: Array
+
+    def fits(self, scale: Array, top: float) -> bool:
+        """Say whether no variance is so small beside outputs of these scales (p,) and this size that it is lifted."""
+        return bool((self.R > 2.0 * _EXACT * np.maximum(scale[-len(self.R) :], math.sqrt(_EXACT) * top) ** 2).all())
+
+
+#: Frames that are kept of one model.
+_FRAMES = 64
+
+
+def sites(
+    model: Linear, record: Record, *, outliers: bool = False, frames: dict[bytes, Frame] | None = None
+) -> Sites:
+    """Build the chain of a model without unknown entries.
+
+    `frames` keeps what windows of one model have in common, where its matrices are constant.
+    """
+    y = np.where(record.seen, record.y, 0.0)
+    scale = first_scales(model, [record.y[record.seen[:, j], j] for j in range(model.ny)])
+    kept, frame = b"", None
+    if frames is not None and isinstance(model.x0, Normal):
+        kept = record.seen.tobytes()
+        frame = frames.get(kept)
+    if frame is None or not frame.fits(scale, float(np.abs(y).max())):
+        frame = _frame(model, record, scale, outliers)
+        if frames is not None and kept and _constant(model):
+            if len(frames) >= _FRAMES:
+                del frames[next(iter(frames))]
+            frames[kept] = frame
+    problem = frame.problem | _first_state(model, record)
+    if frame.B is None:
+        problem["b"] = _added(model, record)
+    else:
+        problem["b"] = np.zeros((len(record), model.nx)) if record.u is None else record.u @ frame.B.T
+    # bounds have no output, and the target 0
+    problem["y"] = np.einsum("kj,kj->k", frame.Y, y[np.maximum(frame.row, 0)])
+    return Sites(
+        problem, frame.free, frame.floor, frame.cap, scale, frame.count, frame.uniform, frame.row, frame.output
+    )
+
+
+def _constant(model: Linear) -> bool:
+    """Say whether a frame of the model serves other rows."""
+    noises = [part for part in (gaussian_part(model.w), gaussian_part(model.e)) if part is not None]
+    return model.loss is None and all(
+        m.value is not None and m.value.ndim == 2 for m in (*model.matrices.values(), *(part.cov() for part in noises))
+    )
+
+
+def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame:
     T, nx, ny = len(record), model.nx, model.ny
     dt = record.steps(model.dt)
     p = nx + ny
     floor, cap, uniform = _half_widths(model)
-    scale = first_scales(model, [record.y[record.seen[:, j], j] for j in range(ny)])
     problem: dict[str, Any] = {"groups": p, "wide": WIDE}
     _dynamics(problem, model, record, dt)
-    _first_state(problem, model, record)
     w_group = np.where(uniform[:nx] & (cap[:nx] > 0), np.arange(nx), -1)
     problem["group_w"] = w_group.astype(np.int32)
     rows = _outputs(model, record, dt, scale, outliers)
@@ -98,21 +172,22 @@ def sites(model: Linear, record: Record, *, outliers: bool = False) -> Sites:
         return np.ascontiguousarray(np.concatenate([getattr(r, name) for r in rows])[order], dtype=dtype)
 
     problem["h"] = joined("h", float, (nx,))
-    for name, dtype in (
-        ("y", float),
-        ("kind", np.int8),
-        ("group", np.int32),
-        ("R", float),
-        ("lo", float),
-        ("hi", float),
-    ):
+    for name, dtype in (("kind", np.int8), ("group", np.int32), ("R", float), ("lo", float), ("hi", float)):
         problem[name] = joined(name, dtype)
     problem["lost"] = joined("lost", float) if (problem["kind"] == MAYBE_LOST).any() else None
     problem["mix"] = joined("mix", float, (p,)) if any(r.mix.any() for r in rows) else None
     output = joined("output", np.intp)
     count = np.r_[np.full(nx, float(T)), [float(np.count_nonzero(output == j)) for j in range(ny)]]
     free = uniform & (floor < cap) & (count > 0)
-    return Sites(problem, free, floor, cap, scale, count, uniform, stage[order] - 1, output)
+    B = None
+    if all(m is None or m.constant for m in (model.B, model.E)):
+        B = np.zeros((nx, model.nu)) if model.B is None else model.B.single
+        B = B if problem["G"] is None else problem["G"][0] @ B
+    part = gaussian_part(model.e)
+    R = np.full(ny, np.inf)
+    if part is not None and uniform_part(model.e) is None and part.cov().constant:
+        R = np.diagonal(part.cov().single)
+    return Frame(problem, free, floor, cap, count, uniform, stage[order] - 1, output, B, joined("Y", float, (ny,)), R)
 
 
 def _half_widths(model: Linear) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -153,13 +228,9 @@ def _one(matrix: Varying | None, record: Record, dt: Array) -> tuple[Array, NDAr
 
 
 def _dynamics(problem: dict[str, Any], model: Linear, record: Record, dt: Array) -> None:
-    T, nx = len(record), model.nx
     part = gaussian_part(model.w)
     problem["G"] = problem["G_index"] = problem["Q"] = problem["Q_index"] = None
     A, A_index = _one(model.A, record, dt)
-    b = np.zeros((T, nx))
-    if model.B is not None and record.u is not None:
-        b = np.einsum("tij,tj->ti", _every(model.B, record, dt), record.u)
     Q = None if part is None else part.cov()
     if Q is not None:
         problem["Q"], problem["Q_index"] = _one(Q, record, dt)
@@ -167,28 +238,34 @@ def _dynamics(problem: dict[str, Any], model: Linear, record: Record, dt: Array)
         if model.E.constant:
             G = np.linalg.inv(model.E.single)[None]
             A = G @ A
-            b = b @ G[0].T
             if Q is not None:
                 problem["Q"] = G @ problem["Q"] @ G[0].T
         else:
             G = np.linalg.inv(_every(model.E, record, dt))
             A, A_index = G @ _every(model.A, record, dt), None
-            b = np.einsum("tij,tj->ti", G, b)
             if Q is not None:
                 problem["Q"], problem["Q_index"] = G @ _every(Q, record, dt) @ np.swapaxes(G, 1, 2), None
         problem["G"] = np.ascontiguousarray(G, dtype=float)
     if problem["Q"] is not None:
         problem["Q"] = np.ascontiguousarray(problem["Q"], dtype=float)
     problem["A"], problem["A_index"] = np.ascontiguousarray(A, dtype=float), A_index
-    problem["b"] = np.ascontiguousarray(b)
 
 
-def _first_state(problem: dict[str, Any], model: Linear, record: Record) -> None:
-    """Put the prior of x0: Gaussian, uniform in a box, or so wide that it says nothing where the box has no end."""
+def _added(model: Linear, record: Record) -> Array:
+    """Return what inputs add to the state of each row, (T, nx), where a matrix varies."""
+    b, dt = np.zeros((len(record), model.nx)), record.steps(model.dt)
+    if model.B is not None and record.u is not None:
+        b = np.einsum("tij,tj->ti", _every(model.B, record, dt), record.u)
+    if model.E is not None:
+        b = np.linalg.solve(_every(model.E, record, dt), b[:, :, None])[:, :, 0]
+    return np.ascontiguousarray(b)
+
+
+def _first_state(model: Linear, record: Record) -> dict[str, Any]:
+    """Return the prior of x0: Gaussian, uniform in a box, or so wide that it says nothing where the box has no end."""
     x0, nx = model.x0, model.nx
     if isinstance(x0, Normal):
-        problem |= {"m0": np.array(x0.mean), "P0": np.array(x0.P), "half0": np.zeros(nx)}
-        return
+        return {"m0": np.ascontiguousarray(x0.mean), "P0": np.ascontiguousarray(x0.P), "half0": np.zeros(nx)}
     assert isinstance(x0, Box)
     finite = np.isfinite(x0.lo) & np.isfinite(x0.hi)
     m0, half = np.array(x0.mean), np.where(finite, 0.5 * (x0.hi - x0.lo), 0.0)
@@ -201,7 +278,7 @@ def _first_state(problem: dict[str, Any], model: Linear, record: Record) -> None
         wide = np.maximum(1e3 * base.column[:nx], 10.0 * np.abs(base.X[:nx]))
         m0 = np.where(finite, m0, base.X[:nx])
         P0 = np.diag(np.where(finite, 0.0, wide**2))
-    problem |= {"m0": np.ascontiguousarray(m0, dtype=float), "P0": P0, "half0": half}
+    return {"m0": np.ascontiguousarray(m0, dtype=float), "P0": P0, "half0": half}
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +287,7 @@ class _Rows:
 
     stage: NDArray[np.intp]
     h: Array
-    y: Array
+    Y: Array  # (K, ny): seen outputs of the row to the target
     kind: NDArray[np.int8]
     group: NDArray[np.int32]
     R: Array
@@ -222,9 +299,9 @@ class _Rows:
 
     @classmethod
     def of(cls, p: int, stage: NDArray[np.intp], h: Array, kind: Any, **more: Any) -> "_Rows":
-        """Fill in what a kind of row does not have."""
+        """Fill in what a kind of row does not have; p half-widths, of states and outputs."""
         K = len(stage)
-        none = {"y": np.zeros(K), "group": np.full(K, -1), "R": np.zeros(K), "lo": np.zeros(K), "hi": np.zeros(K)}
+        none = {"Y": np.zeros((K, p - h.shape[1])), "group": np.full(K, -1), "R": np.zeros(K), "lo": np.zeros(K), "hi": np.zeros(K)}
         none |= {"lost": np.zeros(K), "mix": np.zeros((K, p)), "output": np.full(K, -1)}
         return cls(stage=stage, h=h, kind=np.broadcast_to(np.asarray(kind, dtype=np.int8), (K,)), **(none | more))
 
@@ -235,8 +312,8 @@ def _outputs(model: Linear, record: Record, dt: Array, scale: Array, outliers: b
     if uniform_part(model.e) is None:
         return _gaussian_outputs(model, record, dt, scale)
     C, seen = _every(model.C, record, dt), record.seen
-    y = np.where(seen, record.y, 0.0)
     t, j = np.nonzero(seen)
+    Y = np.eye(ny)[j]
     R = np.zeros((T, ny))
     part = gaussian_part(model.e)
     if part is not None:
@@ -245,7 +322,7 @@ def _outputs(model: Linear, record: Record, dt: Array, scale: Array, outliers: b
     if model.F is not None:
         F = _every(model.F, record, dt)
         N = _eliminate(F, seen)
-        C, y = N @ C, np.einsum("tij,tj->ti", N @ F, y)
+        C, Y = N @ C, (N @ F)[t, j]
         R = np.einsum("tij,tj->ti", N**2, R)
         mix[:, nx:] = np.where(np.eye(ny)[j] > 0, 0.0, N[t, j] ** 2 / 3.0)
     more: dict[str, Any] = {"lost": np.zeros(len(t))}
@@ -256,7 +333,7 @@ def _outputs(model: Linear, record: Record, dt: Array, scale: Array, outliers: b
         kind = np.full(len(t), CONTAMINATED)
     else:
         kind = np.where((R[t, j] > 0) | mix.any(axis=1), UNIFORM_GAUSSIAN, UNIFORM)
-    return [_Rows.of(p, t + 1, C[t, j], kind, y=y[t, j], group=nx + j, R=np.array(R[t, j]), mix=mix, output=j, **more)]
+    return [_Rows.of(p, t + 1, C[t, j], kind, Y=Y, group=nx + j, R=np.array(R[t, j]), mix=mix, output=j, **more)]
 
 
 def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) -> list[_Rows]:
@@ -285,7 +362,7 @@ def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) ->
         )
         if model.loss is not None:  # a loss strikes one sensor: `refused` has seen to a diagonal R
             for a, j in enumerate(s):
-                more = {"y": y[t, j], "R": part_R[:, a, a], "output": np.full(t.size, j)}
+                more = {"Y": np.tile(np.eye(ny)[j], (t.size, 1)), "R": part_R[:, a, a], "output": np.full(t.size, j)}
                 more["lost"] = _lost(model, record, dt, t, np.full(t.size, j))
                 found.append(_Rows.of(p, t + 1, C[t, j], MAYBE_LOST, **more))
             continue
@@ -295,13 +372,14 @@ def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) ->
             spread = np.einsum("tii->t", part_R)[:, None, None] * 1e-12
             L = np.linalg.cholesky(part_R + spread * np.eye(s.size))
         h = np.linalg.solve(L, C[t][:, s])
-        white = np.linalg.solve(L, y[t][:, s, None])[:, :, 0]
+        white = np.zeros((t.size, s.size, ny))
+        white[:, :, s] = np.linalg.inv(L)
         # the whitened row keeps the unit of its output, so that its density is the output's own
         d = np.diagonal(L, axis1=1, axis2=2)
         for a, j in enumerate(s):
             found.append(
                 _Rows.of(
-                    p, t + 1, h[:, a] * d[:, a, None], GAUSSIAN, y=white[:, a] * d[:, a], R=d[:, a] ** 2,
+                    p, t + 1, h[:, a] * d[:, a, None], GAUSSIAN, Y=white[:, a] * d[:, a, None], R=d[:, a] ** 2,
                     output=np.full(t.size, j),
                 )
             )  # fmt: skip

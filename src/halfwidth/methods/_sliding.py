@@ -257,10 +257,9 @@ class Sliding:
         assert held is not None
         assert isinstance(method, Posterior)
         seen = np.asarray(part.seen.any(axis=1))
-        warm = None if held.warm is None else (held.warm, a)
-        rows = max(int(seen.sum()), self.window.memory + 1)
-        answer = method.resumed(model, part, held.s, held.known(self.first + a, rows), warm)
+        answer = method.resumed(model, part, held, self.first + a, a, max(len(part) - self.window.lag, 0))
         newest = self.first + len(self.times) - 1
+        rows = max(int(seen.sum()), self.window.memory + 1)
         held.take(answer, newest, rows, counts=bool(seen[-1]))
         return answer.estimate
 

@@ -34,9 +34,9 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
-from halfwidth.methods._carry import WARP, Known, Warm, condition
+from halfwidth.methods._carry import WARP, Carried, Known, Start, condition
 from halfwidth.methods._protocol import typed
-from halfwidth.methods._sites import Sites, gaussian_part, sites, uniform_part
+from halfwidth.methods._sites import Frame, Sites, gaussian_part, sites, uniform_part
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
@@ -48,8 +48,10 @@ _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 POWER = 0.5
 #: Nodes of a stage, and most stages (core/ep_learn.hpp).
 _STAGE, _STAGES = 16, 8
+#: Of the search and the nodes. The mode of the window before is a good centre of nodes up to the distance `near`, in
+#: standard deviations.
 _LIMITS = {
-    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "least": 0.3,
+    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "near": 0.8, "least": 0.3,
     "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
     "stage": _STAGE, "enough": 0.0, "usable": 0.1,
 }  # fmt: skip
@@ -58,8 +60,6 @@ _LIMITS = {
 _LONG = 2000
 _FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
-#: The mode of the window before is a good centre of nodes up to this distance, in standard deviations.
-_NEAR = 0.8
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
@@ -217,61 +217,63 @@ class Posterior:
         return self.answer(model, record).estimate
 
     def resumed(
-        self, model: Model, record: Record, s: Array | None, known: Known | None, warm: tuple[Warm, int] | None = None
+        self, model: Model, record: Record, held: Carried, first: int, drop: int, shaped: int = 0
     ) -> "Answer":
         """Return the answer of one window of a stream.
 
-        `s` is where to start, `known` what earlier rows told, `warm` the sites of the window before and how many rows
-        later this one begins.
+        `held` is what earlier windows handed on, `first` the number of the window's first row, which lies `drop` rows
+        after that of the window before; skewness and kurtosis are asked for from stage `shaped` on.
         """
+        known = held.known(first, len(record))
         if isinstance(model, Nonlinear):
             from halfwidth.methods._relinearise import relinearised
 
-            return relinearised(self, model, record, s=s, known=known)
-        return self.answer(model, record, start=s, known=known, warm=warm)
+            return relinearised(self, model, record, s=None if held.start is None else held.start.s, known=known)
+        return self.answer(
+            model, record, start=held.start, drop=drop, known=known, frames=held.frames, shaped=shaped
+        )
 
     def answer(
         self,
         model: Linear,
         record: Record,
         *,
-        start: "Start | Array | None" = None,
+        start: Start | Array | None = None,
+        drop: int = 0,
         known: Known | None = None,
-        warm: tuple[Warm, int] | None = None,
+        frames: dict[bytes, Frame] | None = None,
+        shaped: int = 0,
     ) -> "Answer":
         """Return the estimate of a model without unknown entries, and what the next one may start from.
 
-        `start` holds half-widths (p,), with the sites that belong to them if the chain has the same shape; `known` is
-        what other rows told of half-widths; `warm` as in `resumed`.
+        `start` holds half-widths (p,), with the sites of a chain that begins `drop` rows earlier if there is one;
+        `known` is what other rows told of half-widths; `frames` as in `sites`; `shaped` as in `resumed`.
         """
         if isinstance(start, np.ndarray):
-            start = Start(start, None)
-        problem = sites(model, record, outliers=self.outliers is not False and self.outliers != 0)
-        if warm is not None and problem.free.any():
-            start = Start(warm[0].s, warm[0].moved(problem, warm[1]))
+            start = Start(start)
+        problem = sites(model, record, outliers=self.outliers is not False and self.outliers != 0, frames=frames)
         if start is None and len(record) > 2 * _FIRST and problem.free.any():
             # The first rows alone say where to look.
             cut = {k: v.value[:_FIRST] for k, v in model.matrices.items() if v.value is not None and v.value.ndim == 3}
             short: Linear = replace(model, **cut) if cut else model  # type: ignore[arg-type]
-            first = Record(record.t[:_FIRST], record.y[:_FIRST], None if record.u is None else record.u[:_FIRST])
+            begin = Record(record.t[:_FIRST], record.y[:_FIRST], None if record.u is None else record.u[:_FIRST])
             try:
-                quick = replace(self, nodes=1).answer(short, first)
+                quick = replace(self, nodes=1).answer(short, begin)
             except BadShape:  # a noise stacked row by row
                 quick = None
             if quick is not None and int(quick.found["code"]) < 2:
-                start = Start(np.where(quick.chain.free, quick.start.s, math.sqrt(3.0) * problem.scale), None)
-        known = None if known is None else known.of(problem.free)
-        found = self._solve(problem, model, start, known)
-        return Answer(self._estimate(problem, found, model, record), problem, found, known)
+                start = Start(np.where(quick.chain.free, quick.start.s, math.sqrt(3.0) * problem.scale))
+        found = self._solve(problem, model, start, drop, known, shaped)
+        return Answer(self._estimate(problem, found, model, record), problem, found)
 
-    def _solve(self, chain: Sites, model: Linear, start: "Start | None", known: Known | None) -> dict[str, Any]:
+    def _solve(
+        self, chain: Sites, model: Linear, start: Start | None, drop: int, known: Known | None, shaped: int
+    ) -> dict[str, Any]:
         rate, learn_rate, beta = self._rate(model)
-        first = np.where(chain.uniform, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), 0.0)
+        first = np.where(chain.uniform, (math.sqrt(3.0) * chain.scale).clip(chain.floor, chain.cap), 0.0)
         first = np.where(chain.free, first, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
-        sites_, was = None, None
         if start is not None:
-            first = np.where(chain.free, np.clip(start.s, chain.floor, chain.cap), first)
-            sites_, was = start.sites, first if start.sites is not None else None
+            first = np.where(chain.free, start.s.clip(chain.floor, chain.cap), first)
         q = int(chain.free.sum()) + learn_rate
         limits = dict(_LIMITS)
         limits["condition"] = condition(len(chain.problem["start"]) - 2) if known is None else 0.0  # `known` sees to it
@@ -285,15 +287,13 @@ class Posterior:
             limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
             limits |= _MIXED
-        if sites_ is not None:
-            limits["close"] = _NEAR
         if chain.exact:
             limits["most"] = 1
         return dict(
             _core.ep_learn(
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
                 learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z,
-                limits, sites_, was, None if known is None else known.pull,
+                limits, None if start is None else start.before, drop, shaped, None if known is None else known.pull,
                 None if known is None else known.precision, chain.outside if limits["condition"] > 0 else None,
             )
         )  # fmt: skip
@@ -318,10 +318,13 @@ class Posterior:
         x, P, k3, k4 = found["x"], found["P"], found["k3"], found["k4"]
         sound = code < 2 and bool(np.isfinite(x).all() and np.isfinite(P).all())
         info: dict[str, Any] = {"notes": []}
-        widths = _Widths.of(chain, found) if sound else _Widths.none(chain)
+        s = np.where(chain.free, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), chain.floor)
+        widths = {"mean": s, "sd": np.zeros_like(s), "lo": s, "hi": s}
+        if sound:
+            widths = {name: found[name] for name in widths}
         if sound:
             one = found["nodes"] == 1 and found["mode"].size > 0
-            few = code == 1 if one else found["nodes"] > 1 and widths.effective < _FEW
+            few = code == 1 if one else found["nodes"] > 1 and found["effective"] < _FEW
             status = Status.STALLED if residual > _USABLE else Status.REDUCED if residual > _FINE or few else Status.OK
         loglik: float | None = None
         if sound:
@@ -329,7 +332,7 @@ class Posterior:
             loglik = float(found["log_evidence"] - found["log_prior"] - 0.5 * q * math.log(2 * math.pi))
         else:
             status = Status.INFEASIBLE if code >= 2 else Status.STALLED
-            x, P = self._fallback(chain, widths)
+            x, P = self._fallback(chain, s)
             k3 = k4 = np.zeros_like(x)
             info["hint"] = "wider half-widths, outliers=True, or missing outputs; BatchLP() names the rows in conflict"
             info["message"] = (
@@ -366,12 +369,12 @@ class Posterior:
             )
         info |= {
             "x0": x[0].copy(),
-            "half_widths": {"mean": widths.mean, "sd": widths.sd, "lo": widths.lo, "hi": widths.hi},
-            "rate": widths.rate,
+            "half_widths": widths,
+            "rate": found["rate"] if sound else None,
             "residual": residual,
             "sweeps": int(found["sweeps"]),
             "nodes": int(found["nodes"]),
-            "effective": widths.effective,
+            "effective": found["effective"] if sound else 0.0,
         }
         return Estimate(
             record.t,
@@ -379,8 +382,8 @@ class Posterior:
             spread,
             status,
             typed(self),
-            q=widths.mean[:nx].copy() if has_q and sound else None,
-            r=widths.mean[nx:].copy() if has_r and sound else None,
+            q=widths["mean"][:nx].copy() if has_q and sound else None,
+            r=widths["mean"][nx:].copy() if has_r and sound else None,
             gamma=gamma,
             loglik=loglik,
             names=model.names.x,
@@ -388,10 +391,10 @@ class Posterior:
             info=info,
         )
 
-    def _fallback(self, chain: Sites, widths: "_Widths") -> tuple[Array, Array]:
-        """Return the moments of the chain with every uniform replaced by a Gaussian of its variance."""
+    def _fallback(self, chain: Sites, s: Array) -> tuple[Array, Array]:
+        """Return the moments of the chain with every uniform replaced by a Gaussian of its variance; s (p,)."""
         problem = dict(chain.problem, half0=np.maximum(chain.problem["half0"], 0.0))
-        s = np.ascontiguousarray(np.where(widths.mean > 0, widths.mean, 1e-9 * np.maximum(chain.scale, 1e-290))[None])
+        s = np.ascontiguousarray(np.where(s > 0, s, 1e-9 * np.maximum(chain.scale, 1e-290))[None])
         found = _core.ep_run(problem, s, np.zeros(1), 0, 1.0, 1.0, None)
         x, P = found["x"][0], found["P"][0]
         bad = ~(np.isfinite(x).all(axis=1) & np.isfinite(P).all(axis=(1, 2)))
@@ -401,72 +404,26 @@ class Posterior:
         return x, P
 
 
-class Start(NamedTuple):
-    """What an evaluation may start from: half-widths (p,) and the sites that belong to them."""
-
-    s: Array
-    sites: tuple[Array, Array, Array, Array] | None
-
-
 class Answer(NamedTuple):
-    """An estimate, its chain, what the core found and what it was told beforehand."""
+    """An estimate, its chain and what the core found."""
 
     estimate: Estimate
     chain: Sites
     found: dict[str, Any]
-    known: Known | None
 
     @property
     def start(self) -> Start:
-        """Where the mode is, for the next evaluation of a chain of the same shape."""
+        """Where the mode is, for the next evaluation of this chain or of one that begins some rows later."""
         s = self.chain.floor.copy()
-        free = np.flatnonzero(self.chain.free)
-        s[free] = np.exp(self.found["mode"][: free.size])
-        return Start(np.where(self.chain.free, s, self.chain.cap), self.found["sites"])
+        free = self.chain.free
+        s[free] = np.exp(self.found["mode"][: np.count_nonzero(free)])
+        before = (self.chain.problem["start"], *self.found["sites"])
+        return Start(np.where(free, s, self.chain.cap), before)
 
-
-class _Widths(NamedTuple):
-    """Posterior of the half-widths (q, r), each (p,), and of the rate."""
-
-    mean: Array
-    sd: Array
-    lo: Array
-    hi: Array
-    rate: float | None
-    effective: float
-
-    @classmethod
-    def none(cls, chain: Sites) -> "_Widths":
-        """Known half-widths as they are, free ones generously from the data's scale."""
-        s = np.where(chain.free, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), chain.floor)
-        return cls(s, np.zeros_like(s), s, s, None, 0.0)
-
-    @classmethod
-    def of(cls, chain: Sites, found: dict[str, Any]) -> "_Widths":
-        mean = chain.floor.copy()
-        sd, lo, hi = np.zeros_like(mean), mean.copy(), mean.copy()
-        free = np.flatnonzero(chain.free)
-        K = int(found["nodes"])
-        phi = found["phi"][:K]
-        weight = np.ones(1)
-        if K > 1:
-            weight = np.exp(found["log_weight"][:K] - found["log_weight"][:K].max())
-            weight /= weight.sum()
-        s = np.exp(phi[:, : free.size])
-        m = weight @ s
-        mean[free] = m
-        # one node stands for a narrow posterior: its width is that of the Gaussian at the mode
-        blur = np.linalg.inv(found["H"]) if K == 1 and phi.shape[1] else np.zeros((phi.shape[1], phi.shape[1]))
-        sd[free] = np.sqrt(weight @ (s - m) ** 2 + m**2 * np.diagonal(blur)[: free.size])
-        for k, j in enumerate(free):
-            order = np.argsort(s[:, k])
-            below = np.cumsum(weight[order])
-            lo[j] = s[order[np.searchsorted(below, 0.05)], k] if K > 1 else max(m[k] - 1.645 * sd[j], 0.0)
-            hi[j] = s[order[min(int(np.searchsorted(below, 0.95)), K - 1)], k] if K > 1 else m[k] + 1.645 * sd[j]
-        rate = None
-        if phi.shape[1] > free.size:
-            rate = float(weight @ (1.0 / (1.0 + np.exp(-phi[:, -1]))))
-        return cls(mean, sd, lo, hi, rate, float(1.0 / (weight @ weight)))
+    @property
+    def told(self) -> Known:
+        """What its rows tell of the half-widths."""
+        return Known(self.found["told_pull"], self.found["told_precision"])
 
 
 def _named(share: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
