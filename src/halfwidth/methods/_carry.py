@@ -11,9 +11,10 @@ row speaks twice and the prior of the newest window holds none of its own data. 
 likelihoods is a composite likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by
 exp(-1 / rows) a row.
 
-Bounds are a condition on what is carried: as a mere factor of the evidence they count as an event that small
-half-widths make likely, and over many windows that adds up. A quadratic of log P(inside | u), the evidence of the
-chain with its bounds alone, is taken off for every N-th window, N times as heavy.
+As a factor of the evidence bounds count as an event that small half-widths make likely, and over many windows that adds
+up. So they are a condition in all rows but 26, those of the newest window and those that have left alike (`condition`): a
+quadratic of log P(inside | u), the evidence of the chain with its bounds alone, is taken off. It is found anew in every
+N-th window.
 
 The state before the first row of a window is what the sites of the rows that have left make of it: the forwards message
 of expectation propagation, a Gaussian.

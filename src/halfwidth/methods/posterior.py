@@ -12,14 +12,18 @@ Staying inside `bounds` is an event that small half-widths make likely: over man
 The prior has no scale: where a noise drowns in the others told ~ s^2 and the prior falls to 0, where it is seen told
 is 1 and the prior is a power. `power` is what a study of coverage gave in windows of 6, 26 and 51
 rows (benchmarks/posterior.py).
-Around the mode, weighted nodes carry what is not known of s into the intervals, and first-order corrections of skewness
-and kurtosis bend the Gaussian marginals to the light tails that bounded noise has.
+Weighted nodes carry what is not known of s into the intervals: stages of normal points, the first about the mode, each
+later one with the moments of all before it, weighted by evidence over the mixture of the stages (core/ep_learn.hpp). The
+evidence of a node has what expectation propagation leaves out of it to second order, without which half-widths are
+learned with a bias; first-order corrections of skewness and kurtosis bend the Gaussian marginals to the light tails that
+bounded noise has.
 
 References
 ----------
 Minka (2001), Expectation propagation for approximate Bayesian inference, UAI. Opper, Paquet and Winther (2013),
 Perturbative corrections for approximate inference in Gaussian latent variable models, JMLR 14. Durbin and Koopman
-(2001), ch. 4: the disturbance smoother that gives every cavity. Model: Pavelková and Kárný (2013), eqs. (1), (2).
+(2001), ch. 4: the disturbance smoother that gives every cavity. Cornuet, Marin, Mira and Robert (2012), Adaptive multiple
+importance sampling, Scandinavian Journal of Statistics 39. Model: Pavelková and Kárný (2013), eqs. (1), (2).
 """
 
 import functools
