@@ -27,6 +27,7 @@ namespace HW_ISA {
 constexpr int ep_alone = 10;  // sweeps of a chain with its bounds alone, which starts afresh
 constexpr int ep_stages = 8;  // most stages of points
 constexpr double ep_lean = 4.0;  // points that a first guess of their covariance is worth
+constexpr double ep_wide = 1.15;  // by how much a stage reaches farther than the posterior is thought to
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
 template <class N>
@@ -422,6 +423,7 @@ struct EpLearner {
         at.log_det = 0.0;
         for (int j = 0; j < q; j++) {
             at.m[j] = m[j];
+            for (int i = 0; i <= j; i++) at.K[j][i] *= ep_wide;
             at.log_det += std::log(at.K[j][j]);
         }
     }

@@ -55,9 +55,9 @@ _STAGE, _STAGES = 16, 8
 #: Of the search and the nodes. The mode of the window before is a good centre of nodes up to the distance `near`, in
 #: standard deviations.
 _LIMITS = {
-    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "near": 0.8, "least": 0.3,
+    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "near": 0.8, "least": 2.0,
     "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
-    "stage": _STAGE, "enough": 0.0, "usable": 0.1,
+    "stage": _STAGE, "enough": 0.06, "usable": 0.1,
 }  # fmt: skip
 #: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
 #: with them; there is less left to integrate.
@@ -129,7 +129,7 @@ class Posterior:
     """
 
     method: Literal["ep", "sample"] = "ep"
-    nodes: int = 64
+    nodes: int = 128
     outliers: float | bool = False
     rounds: int = 20
     iterations: int = 200
