@@ -1,13 +1,15 @@
 """Print how many removed fixes lie in the half-widths that `fill` states, for a user who never saw them.
 
     python benchmarks/coverage.py [LOGS OR FOLDER ...] [--simulated 8] [--lengths 5,10,20,30,60] [--gaps 40] [--seed 1]
+                                  [--method tube]
 
-Fixes are removed at random places before `fill` sees the log, several gaps at a time if they are far apart; the log is
+Fixes are removed at evenly spread places from a random first one on before `fill` sees the log, several gaps at a time if they are far apart; the log is
 then filled as a user would, with its own choice of method and its own test of the half-widths on what is left. The
 removed fixes, east and north counted apart, are inside or not. Gaps drawn at random overlap each other, so the standard
 error beside the share weighs each pair of gaps by how much of them is the same stretch of the log (Bartlett's kernel);
-"apart" says how many gaps of that length the log has room for. The score is that of Winkler (1972): the whole width,
-and 2 / (1 - level) times what a fix lies beyond it; a lower one is better, and neither wide nor lucky intervals win.
+"apart" says how many gaps of that length the log has room for. The line "all" is over every gap of the log, each
+counting the same. The score is that of Winkler (1972): the whole width, and 2 / (1 - level) times what a fix lies
+beyond it; a lower one is better, and neither wide nor lucky intervals win.
 
 Simulated drives, with errors of the fixes drawn anew for each, show the same, and beside it how often the *truth* lies
 inside the stated interval, and inside the one that `Track.truth_half_m` states.
@@ -28,15 +30,18 @@ APART = 60.0
 
 
 def places(log, length, rng):
-    """Draw the beginnings of gaps that one run removes: moving, with fixes on both sides, far from each other."""
+    """Draw the beginnings of gaps that one run removes: moving, with fixes on both sides, far from each other.
+
+    They are evenly spread from a random first one on, so that every place of the log is as likely as any other: gaps
+    drawn one by one, each far from those before, crowd at the ends.
+    """
     t = log.t[log.fixed]
     east, north = Frame.of(log).to_local(log.lat_deg[log.fixed], log.lon_deg[log.fixed])
     usual = np.median(np.diff(t))
+    period = length + max(APART, length)
     chosen = []
-    for begin in rng.uniform(t[0] + MARGIN, t[-1] - MARGIN - length, 400):
+    for begin in np.arange(t[0] + MARGIN + rng.uniform(0, period), t[-1] - MARGIN - length, period):
         a, b = np.searchsorted(t, [begin, begin + length])
-        if any(abs(begin - other) < length + max(APART, length) for other in chosen):
-            continue
         whole = b - a >= 0.8 * length / usual - 1
         # moved further than the fixes scatter
         inside = np.column_stack((east[a:b], north[a:b]))[:: max(1, round(1.0 / usual))]
@@ -47,12 +52,12 @@ def places(log, length, rng):
     return chosen
 
 
-def one_run(log, begins, length, truth=None):
+def one_run(log, begins, length, truth=None, drive=0, **how):
     """Remove gaps, fill, and return for each the errors and half-widths at the removed fixes, (n, 2) each."""
     hidden = log
     for begin in begins:
         hidden = hidden.without(begin, begin + length)
-    track = hw.vehicle.fill(hidden)
+    track = hw.vehicle.fill(hidden, **how)
     frame = Frame.of(log)
     found = []
     for begin in begins:
@@ -65,7 +70,7 @@ def one_run(log, begins, length, truth=None):
         off = np.column_stack(frame.to_local(track.lat_deg[at], track.lon_deg[at]))
         off -= np.column_stack(frame.to_local(log.lat_deg[rows], log.lon_deg[rows]))
         half = np.column_stack((track.east_half_m[at], track.north_half_m[at]))
-        one = {"begin": begin, "off": off, "half": half, "track": track}
+        one = {"begin": begin, "length": length, "drive": drive, "off": off, "half": half, "level": track.level}
         if truth is not None:
             when = track.t_s[at] - truth.clock_offset  # the track is on the clock of the fixes
             one["true"] = np.column_stack(truth.error_m(when, track.lat_deg[at], track.lon_deg[at]))
@@ -76,20 +81,23 @@ def one_run(log, begins, length, truth=None):
 
 def share_and_error(inside, begin, length, drive):
     """Return the mean share inside and its standard error; gaps of one drive that overlap are not independent."""
-    inside, begin, drive = (np.asarray(v) for v in (inside, begin, drive))
+    inside, begin, length, drive = (np.asarray(v) for v in (inside, begin, length, drive))
     rest = inside - inside.mean()
-    alike = (drive[:, None] == drive) * np.maximum(0.0, 1 - np.abs(begin[:, None] - begin) / (1.5 * length))
+    middle, mean = begin + length / 2, (length[:, None] + length) / 2
+    alike = (drive[:, None] == drive) * np.maximum(0.0, 1 - np.abs(middle[:, None] - middle) / (1.5 * mean))
     return inside.mean(), float(np.sqrt(max(rest @ alike @ rest, 0.0)) / inside.size)
 
 
-def row(name, length, gaps, drives, room, level, seconds, truths):
-    """Print one line of the table."""
+def row(length, gaps, room, seconds, truths):
+    """Print one line of the table; `length` is None for the gaps of all lengths."""
+    level = gaps[0]["level"]
     inside = [np.mean(np.abs(g["off"]) <= g["half"]) for g in gaps]
-    share, error = share_and_error(inside, [g["begin"] for g in gaps], length, drives)
+    share, error = share_and_error(inside, *([g[key] for g in gaps] for key in ("begin", "length", "drive")))
     mean = np.mean([np.hypot(*g["off"].T).mean() for g in gaps])
     off, half = (np.concatenate([g[key] for g in gaps]).ravel() for key in ("off", "half"))
     score = np.mean(2 * half + 2 / (1 - level) * np.maximum(np.abs(off) - half, 0))
-    text = f"{name:>8} {length:>4g} s{len(gaps):>6}{room:>7.0f}{mean:>9.2f}{share:>8.3f} +- {error:.3f}"
+    said = f"{'all':>15}" if length is None else f"{length:>13g} s"
+    text = f"{said}{len(gaps):>6}{room:>7.0f}{mean:>9.2f}{share:>8.3f} +- {error:.3f}"
     text += f"{np.median(half):>9.2f}{score:>9.2f}{seconds:>8.2f}"
     if truths:
         for key in ("half", "truth_half"):
@@ -101,24 +109,28 @@ def row(name, length, gaps, drives, room, level, seconds, truths):
 HEAD = f"{'':15}{'gaps':>6}{'apart':>7}{'mean m':>9}{'inside':>8}    s.e.{'half m':>9}{'score m':>9}{'s':>8}"
 
 
-def on_log(log, lengths, wanted, seed):
+def on_log(log, lengths, wanted, seed, **how):
     """Print the table of one log."""
     print(HEAD)
+    every = []
     for length in lengths:
         rng = np.random.default_rng([seed, round(1000 * length)])
-        gaps, seconds = [], []
-        for _ in range(wanted):
+        gaps, seconds, empty = [], [], 0
+        while len(gaps) < wanted:
             begins = places(log, length, rng)
             if not begins:
-                break
+                empty += 1
+                if empty == 20:
+                    break
+                continue
             clock = time.process_time()
-            gaps += one_run(log, begins, length)
+            gaps += one_run(log, begins, length, **how)
             seconds.append(time.process_time() - clock)
-            if len(gaps) >= wanted:
-                break
         if gaps:
-            room = np.ptp(log.t[log.fixed]) / length
-            row("", length, gaps, [0] * len(gaps), room, gaps[0]["track"].level, np.median(seconds), False)
+            row(length, gaps, np.ptp(log.t[log.fixed]) / length, np.median(seconds), False)
+            every += gaps
+    if every:
+        row(None, every, np.nan, np.nan, False)
 
 
 def drives(count, seed):
@@ -142,21 +154,22 @@ def drives(count, seed):
         )
 
 
-def on_drives(count, lengths, wanted, seed):
+def on_drives(count, lengths, wanted, seed, **how):
     """Print the table of simulated drives, each length over all of them."""
     print(HEAD + f"{'truth':>9}{'in t.h.':>9}{'t.h. m':>9}")
-    made = list(drives(count, seed))
+    made, every = list(drives(count, seed)), []
     for length in lengths:
-        gaps, which, seconds, room = [], [], [], 0.0
+        gaps, seconds, room = [], [], 0.0
         for k, (truth, log) in enumerate(made):
             rng = np.random.default_rng([seed, k, round(1000 * length)])
-            begins = places(log, length, rng)[: max(1, round(wanted / count))]
+            begins = rng.permutation(places(log, length, rng))[: max(1, round(wanted / count))].tolist()
             clock = time.process_time()
-            gaps += one_run(log, begins, length, truth) if begins else []
+            gaps += one_run(log, begins, length, truth, k, **how) if begins else []
             seconds.append(time.process_time() - clock)
-            which += [k] * (len(gaps) - len(which))
             room += np.ptp(log.t) / length
-        row("", length, gaps, which, room, gaps[0]["track"].level, np.median(seconds), True)
+        row(length, gaps, room, np.median(seconds), True)
+        every += gaps
+    row(None, every, np.nan, np.nan, True)
 
 
 def main():
@@ -167,6 +180,7 @@ def main():
     parser.add_argument("--gaps", type=int, default=40, help="gaps of each length")
     parser.add_argument("--lengths", default="5,10,20,30,60")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--method", help="of `fill`, instead of its own choice")
     asked = parser.parse_args()
     lengths = [float(length) for length in asked.lengths.split(",")]
     folder = root.parent / "shared" / "data"
@@ -174,10 +188,10 @@ def main():
     logs = [path for one in given for path in (sorted(one.glob("*.csv*")) if one.is_dir() else [one])]
     for path in logs:
         print(f"\n=== {path.name}")
-        on_log(hw.vehicle.read(path), lengths, asked.gaps, asked.seed)
+        on_log(hw.vehicle.read(path), lengths, asked.gaps, asked.seed, method=asked.method)
     if asked.simulated:
         print(f"\n=== {asked.simulated} simulated drives")
-        on_drives(asked.simulated, lengths, asked.gaps, asked.seed)
+        on_drives(asked.simulated, lengths, asked.gaps, asked.seed, method=asked.method)
 
 
 if __name__ == "__main__":

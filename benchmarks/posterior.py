@@ -1,16 +1,19 @@
 """Accuracy and coverage of `Posterior` on the system of Pavelková and Kárný (2013), sec. 6.
 
-    python benchmarks/posterior.py [table] [windows] [streams] [known] [priors] [ensemble] [outliers] [robust] [calibration]
+    python benchmarks/posterior.py [table] [windows] [streams] [known] [variances] [priors] [ensemble] [outliers] [robust]
+                                   [calibration] [pictures]
 
 Paths stay inside the boxes by rejection of whole paths. The Kalman filter is told the true covariances and is clipped to
 the boxes. `windows`: each window of `Delta` + 1 rows on its own, told no half-width and nothing of the past, of which the
 Kalman filter sees 15 rows. `streams`: long paths by `Window(Posterior())`, which carries what it has learned, against the
 Kalman filter on the same rows, after a burn-in of 200 rows; whole paths of that length cannot be rejected, so one is the
 genealogy of a particle among 5,000 that are resampled from those inside at every row. `table` is both; without arguments
-it is printed. The other studies redraw disturbances that would leave the boxes, which is another law. `WINDOWS=500` sets
-the number of windows; streams have six times as many.
+it is printed. `outliers` redraws disturbances that would leave the boxes, which is another law. `calibration` draws
+half-widths from the prior that is used, without bounds. `WINDOWS=500` sets the number of windows; streams have six times
+as many. `PICTURES=folder` writes the diagrams of `calibration` and `pictures` there.
 """
 
+import dataclasses
 import os
 import sys
 import time
@@ -22,8 +25,9 @@ import numpy as np  # noqa: E402
 
 import halfwidth as hw  # noqa: E402
 from halfwidth.methods import posterior  # noqa: E402
-from halfwidth.methods._sliding import Sliding  # noqa: E402
+from halfwidth.methods._sliding import Sliding, stacked  # noqa: E402
 from halfwidth.reproduce.paper003 import BOX, KAPPA, A, B, C, E, F, Q, R  # noqa: E402
+from halfwidth.spread import part as rows_of  # noqa: E402
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 WINDOWS = int(os.environ.get("WINDOWS", "500"))
@@ -176,17 +180,11 @@ def stream_case(delta, *, correlated=False, missing=0.0, seed=11, model=None, re
     mid = (delta + 1) // 2
     kept = slice(BURN_IN + mid, LONG)
     error, theirs, covered, s, seconds, bad = [], [], [], [], 0.0, 0
-    paths = max(1, round(6 * WINDOWS / (LONG - BURN_IN)))
+    paths = max(1, round(12 * WINDOWS / (LONG - BURN_IN)))
     for path in range(paths):
-        rng = np.random.default_rng([seed, path])
-        X, u = stays(rng, LONG, correlated=correlated)
-        y = X[1:] @ C.T + rng.uniform(-R, R, (LONG, 2))
-        if correlated:
-            y = y @ np.linalg.inv(F).T
-        y[rng.random(y.shape) < missing] = np.nan
-        record = hw.Record(np.arange(1.0, LONG + 1), y, u)
+        X, record = along(path, seed, correlated=correlated, missing=missing)
         kf = told_the_truth(record, correlated=correlated)
-        rows = Sliding(hw.Window(hw.Posterior(nodes=32), delta, recall=recall), model, 0.0)
+        rows = Sliding(hw.Window(hw.Posterior(), delta, recall=recall, lag=mid), model, 0.0)
         off, hit, learned = [], [], []
         for t in range(LONG):  # what `lag=0` and `lag=mid` give, in one run
             start = time.process_time()
@@ -220,7 +218,7 @@ def streams():
     """Print errors, coverage and learned half-widths of windows that carry what they have learned."""
     known = system(hw.Uniform(Q), hw.Uniform(R))
     print(
-        f"along {max(1, round(6 * WINDOWS / (LONG - BURN_IN)))} paths of {LONG} rows, the first {BURN_IN} left out; "
+        f"along {max(1, round(12 * WINDOWS / (LONG - BURN_IN)))} paths of {LONG} rows, the first {BURN_IN} left out; "
         "coverage: mean of the filter's end and mid-window"
     )
     for delta in (5, 25, 50):
@@ -277,10 +275,52 @@ def windows_alone():
     show("Delta 25, E, F, missing", one_case(25, correlated=True, missing=0.2))
 
 
+def variances():
+    """Print coverage and bias where variances are unknown, alone and beside half-widths, told and not."""
+    from_ = (0.04, 0.09), (0.25, 0.16)
+    own, box, free = hw.Gaussian.unknown(at_most=100.0), hw.Uniform.unknown(at_most=10.0), hw.Gaussian
+    cases = {
+        "Gaussian, both unknown": (free(from_[0]), free(from_[1]), own, own),
+        "Uniform and Gaussian unknown": (hw.Uniform([0.3, 0.5]), free(from_[1]), box, own),
+        "e: Uniform told, Gaussian unknown": (
+            free(from_[0]),
+            hw.Uniform(0.5) + free(from_[1]),
+            own,
+            hw.Uniform(0.5) + own,
+        ),
+        "e: Uniform unknown, Gaussian told": (free(from_[0]), hw.Uniform(1.0) + free(0.05), own, box + free(0.05)),
+        "e: sum of two unknown": (free(from_[0]), hw.Uniform(1.0) + free(0.05), own, box + own),
+        "w: Uniform told, Gaussian unknown": (
+            hw.Uniform(0.3) + free(from_[0]),
+            free(from_[1]),
+            hw.Uniform(0.3) + own,
+            own,
+        ),
+    }
+    model = np.array([[0.9, 0.2], [0, 0.8]]), None, np.eye(2)
+    count = min(WINDOWS, 200)
+    for rows in (6, 26, 51):
+        for name, (w, e, asked_w, asked_e) in cases.items():
+            rng, hit, learned, bad = np.random.default_rng(11), [], [], 0
+            for _ in range(count):
+                x0 = hw.Normal(np.zeros(2), 1.0)
+                truth, record = hw.simulate(hw.Linear(*model, w, e, x0), T=rows, seed=int(rng.integers(2**31)))
+                est = hw.estimate(hw.Linear(*model, asked_w, asked_e, x0), record, hw.Posterior())
+                bad += not est.status.good
+                hit.append([np.mean((lo <= truth.x) & (truth.x <= hi)) for lo, hi in map(est.interval, LEVELS)])
+                learned.append([v for v in (est.q, est.r, est.Q, est.R) if v is not None])
+            error = 100 * np.std(hit, axis=0).max() / np.sqrt(count)
+            print(
+                f"{rows:3d} rows  {name:<34} {' '.join(f'{100 * v:5.1f}' for v in np.mean(hit, axis=0))}  (+-{error:.1f})  "
+                f"learned {' '.join(np.array2string(v, precision=3) for v in np.mean(learned, axis=0))}  bad {bad}",
+                flush=True,
+            )
+
+
 def priors():
     """Print coverage and bias for other powers of the prior."""
     kept = posterior.POWER
-    for power in (0.4, 0.6, 0.85, 1.1):
+    for power in (0.25, 0.5, 0.75):
         posterior.POWER = power
         for delta in (5, 25, 50):
             show(f"power {power}, Delta {delta}", one_case(delta, count=min(WINDOWS, 200)))
@@ -288,40 +328,79 @@ def priors():
 
 
 def ensemble():
-    """Compare widths with the interval of the paper at the coverage that it has."""
-    print("width at mid-window over that of the paper's ensemble interval of equal coverage, Delta 25")
-    rng = np.random.default_rng(3)
-    rows = min(4 * WINDOWS, 2000)
-    X, record = drawn(rng, rows)
-    unknown = hw.Uniform.unknown(at_most=1.0)
-    model = system(unknown, unknown)
-    theirs = hw.estimate(model, record, hw.Window(hw.BatchLP(objective="paper", point="optimal"), 25, fixes=0))
-    inner = slice(40, rows - 40)
-    found = []
-    for a in range(0, rows - 26, 13):
-        est = hw.estimate(
-            model, hw.Record(record.t[a : a + 26], record.y[a : a + 26], record.u[a : a + 26]), hw.Posterior()
-        )
-        found.append((a + 12, est))
-    for kappa in KAPPA:
-        lo, hi = hw.ensemble_interval(theirs, kappa)
-        inside = ((X[1:] >= lo) & (X[1:] <= hi))[inner].mean()
-        width = (hi - lo)[inner].mean()
-        level = _level(found, X, inside)
-        ours = np.mean([np.subtract(*est.interval(level)[::-1])[12] for _, est in found])
+    """Compare widths with the interval of the paper, eq. (31), each at the coverage that the paper's has."""
+    paths = max(1, round(WINDOWS / 125))
+    for correlated in (False, True):
         print(
-            f"  kappa {kappa:g}: covers {inside:.1%}, width {width:.3f}; ours {ours:.3f} at level {level:.3f}: {width / ours:.2f} times narrower"
+            f"\n{paths} paths of {LONG} rows, the first {BURN_IN} and last {40} left out, Delta 25"
+            + (", E and F" if correlated else "")
+            + "; widths over that of the paper's ensemble interval at the coverage it has"
         )
+        rows = slice(BURN_IN, LONG - 40)
+        theirs, ours, states = [], {}, []
+        for path in range(paths):
+            X, record = along(path, 17, correlated=correlated)
+            unknown = hw.Uniform.unknown(at_most=1.0)
+            model = system(unknown, unknown, correlated=correlated)
+            paper = hw.Window(hw.BatchLP(objective="paper", point="optimal"), 25, fixes=0)
+            theirs.append(hw.estimate(model, record, paper))
+            states.append(X[1:][rows])
+            for name, spread in lagged(model, record).items():
+                ours.setdefault(name, []).append(rows_of(spread, rows))
+        for kappa in KAPPA:
+            ends = [hw.ensemble_interval(est, kappa) for est in theirs]
+            ends = [(lo[rows], hi[rows]) for lo, hi in ends]
+            inside = _inside(ends, states)
+            width = np.mean([hi - lo for lo, hi in ends])
+            line = f"  kappa {kappa:g}: covers {inside:.1%}, width {width:.3f}; narrower by"
+            for name, spreads in ours.items():
+                level = _level(spreads, states, inside)
+                own = np.mean([np.subtract(*s.interval(level)[::-1]) for s in spreads])
+                line += f"  {name}: {width / own:.2f} (level {level:.3f})"
+            print(line, flush=True)
 
 
-def _level(found, X, share):
-    """Return the level whose intervals at mid-window cover this share."""
-    lo, hi = 0.02, 0.998
+def along(path, seed, *, correlated=False, missing=0.0):
+    """Return states and record of one long path that stays inside the box."""
+    rng = np.random.default_rng([seed, path])
+    X, u = stays(rng, LONG, correlated=correlated)
+    y = X[1:] @ C.T + rng.uniform(-R, R, (LONG, 2))
+    if correlated:
+        y = y @ np.linalg.inv(F).T
+    y[rng.random(y.shape) < missing] = np.nan
+    return X, hw.Record(np.arange(1.0, LONG + 1), y, u)
+
+
+def lagged(model, record):
+    """Return the spread of every row from windows that end so many rows later: carrying, alone, and told q and r."""
+    told = dataclasses.replace(model, w=hw.Uniform(Q), e=hw.Uniform(R))
+    found = {}
+    for kind, asked, recall, lags in (
+        ("", model, 40.0, (0, 12, 25)),
+        ("alone", model, 0.0, (12,)),
+        ("told", told, 40.0, (25,)),
+    ):
+        rows = Sliding(hw.Window(hw.Posterior(), 25, recall=recall, lag=max(lags)), asked, 0.0)
+        names = {lag: f"{kind} lag {lag}".strip() for lag in lags}
+        found |= {name: [] for name in names.values()}
+        for t in range(len(record)):
+            solved = rows.push(record.y[t], record.u[t], 1.0)
+            for lag, name in names.items():
+                if t >= lag:
+                    found[name].append(rows_of(solved.spread, slice(-1 - lag, -lag or None)))
+    return {name: stacked(spreads) for name, spreads in found.items()}
+
+
+def _inside(ends, states):
+    return float(np.mean([(x >= lo) & (x <= hi) for (lo, hi), x in zip(ends, states, strict=True)]))
+
+
+def _level(spreads, states, share):
+    """Return the level whose intervals cover this share."""
+    lo, hi = 0.02, 0.9999
     for _ in range(20):
         mid = 0.5 * (lo + hi)
-        inside = np.mean(
-            [(X[k + 1] >= a[12]) & (X[k + 1] <= b[12]) for k, (a, b) in ((k, e.interval(mid)) for k, e in found)]
-        )
+        inside = _inside([s.interval(mid) for s in spreads], states)
         lo, hi = (mid, hi) if inside < share else (lo, mid)
     return 0.5 * (lo + hi)
 
@@ -362,17 +441,20 @@ def robust():
             hw.Uniform(scale * rng.choice([0.0, 1e-6, 0.1, 1.0])),
             hw.Gaussian((scale * rng.choice([0.0, 1e-3, 1.0])) ** 2),
             hw.Uniform.unknown() + hw.Gaussian((0.1 * scale) ** 2),
+            hw.Gaussian.unknown(),
+            hw.Uniform(scale * rng.choice([0.0, 0.1])) + hw.Gaussian.unknown(),
+            hw.Uniform.unknown() + hw.Gaussian.unknown(),
         ]
         prior = [hw.Box(-scale * np.ones(n), scale * np.ones(n)), None, hw.Normal(np.zeros(n), scale**2)][
             rng.integers(3)
         ]
         bounds = [None, (-3 * scale * np.ones(n), 3 * scale * np.ones(n))][rng.integers(2)]
-        e = noise[rng.integers(4)]
+        e = noise[rng.integers(7)]
         model = hw.Linear(
             rng.uniform(-1, 1, (n, n)),
             None,
             rng.standard_normal((ny, n)),
-            noise[rng.integers(4)],
+            noise[rng.integers(7)],
             e,
             prior,
             bounds=bounds,
@@ -383,49 +465,126 @@ def robust():
             y[rng.integers(T)] *= 1e3
         named = not isinstance(e, hw.Gaussian) and rng.random() < 0.3
         est = hw.estimate(model, hw.Record(np.arange(1.0, T + 1), y), hw.Posterior(nodes=8, outliers=bool(named)))
-        numbers = [est.x, *est.interval(0.9), *(v for v in (est.q, est.r, est.loglik) if v is not None)]
+        numbers = [est.x, *est.interval(0.9), *(v for v in (est.q, est.r, est.Q, est.R, est.loglik) if v is not None)]
         bad += not all(np.isfinite(v).all() for v in numbers)
         status[est.status.name] = status.get(est.status.name, 0) + 1
     print(f"{count} random windows: {bad} with a number that is not finite; statuses {status}")
 
 
-def calibration():
-    """Simulation-based calibration: ranks of the true states and half-widths in their posterior, ten bins."""
-    rng = np.random.default_rng(5)
-    ranks, of_s = [], []
-    from scipy.stats import norm
+SBC_Q, SBC_R = (0.04, 0.25), (0.12, 0.75)
 
-    levels = np.linspace(0.1, 0.9, 9)
+
+def from_the_prior(rng, power):
+    """Return half-widths (5,) from s^power in log s between their ends, by the inverse of its distribution."""
+    lo, hi = np.array([SBC_Q] * 3 + [SBC_R] * 2).T ** power
+    return (lo + rng.random(5) * (hi - lo)) ** (1.0 / power)
+
+
+def sbc(*, reference, delta=25, seed=5):
+    """Return estimates, true states, and ranks of true half-widths (windows, 5) under the prior that they are drawn from.
+
+    `reference`: whether the estimates use the default prior, with its factor `told`, in place of the one drawn from.
+    """
+    rng = np.random.default_rng(seed)
+    x0 = hw.Box(0.3 * BOX.lo, 0.3 * BOX.hi)
+    asked = system(hw.Uniform.unknown(*SBC_Q), hw.Uniform.unknown(*SBC_R), x0, bounds=None)
+    kept = posterior._LIMITS["reference"]
+    posterior._LIMITS["reference"] = kept if reference else 0.0
+    ests, true, of_s = [], [], []
     for _ in range(WINDOWS):
-        q, r = np.exp(rng.uniform(np.log(0.05), np.log(0.2), 3)), np.exp(rng.uniform(np.log(0.15), np.log(0.6), 2))
-        true = system(hw.Uniform(q), hw.Uniform(r), hw.Box(0.3 * BOX.lo, 0.3 * BOX.hi), bounds=None)
-        truth, record = hw.simulate(true, rng.uniform(-1, 1, (26, 1)), seed=int(rng.integers(2**31)))
-        unknown = hw.Uniform.unknown(at_most=3.0)
-        est = hw.estimate(system(unknown, unknown, true.x0, bounds=None), record, hw.Posterior())
-        below = np.zeros(est.x.shape)
-        for p in levels:
-            side = est.interval(abs(2 * p - 1)) if p != 0.5 else (est.x, est.x)
-            below += truth.x > (side[0] if p < 0.5 else side[1])
-        ranks.append(below)
-        w = est.info["half_widths"]
-        z = (np.log(np.r_[q, r]) - np.log(w["mean"])) / np.maximum(w["sd"] / w["mean"], 1e-9)
-        of_s.append(norm.cdf(z))
-    counts = np.bincount(np.array(ranks, dtype=int).ravel(), minlength=10)
-    print(
-        f"states, {WINDOWS} windows: share of each tenth, %: "
-        + " ".join(f"{100 * c / counts.sum():.1f}" for c in counts)
-    )
-    bins = np.histogram(np.array(of_s).ravel(), bins=10, range=(0, 1))[0]
-    print(
-        "half-widths:                 share of each tenth, %: " + " ".join(f"{100 * b / bins.sum():.1f}" for b in bins)
-    )
+        s = from_the_prior(rng, posterior.POWER)
+        model = system(hw.Uniform(s[:3]), hw.Uniform(s[3:]), x0, bounds=None)
+        truth, record = hw.simulate(model, rng.uniform(-1, 1, (delta + 1, 1)), seed=int(rng.integers(2**31)))
+        answer = hw.Posterior(nodes=256).answer(asked, record)
+        K = int(answer.found["nodes"])
+        weight = np.exp(answer.found["log_weight"][:K] - answer.found["log_weight"][:K].max())
+        below = answer.found["phi"][:K] < np.log(s)
+        of_s.append(weight @ below / weight.sum())
+        ests.append(answer.estimate)
+        true.append(truth.x)
+    posterior._LIMITS["reference"] = kept
+    return ests, true, np.array(of_s)
+
+
+def calibration():
+    """Simulation-based calibration: ranks of the true states and half-widths in their posterior."""
+    drawn_axes = _figure("calibration", 2, 2)
+    for row, reference in enumerate((False, True)):
+        print(
+            "\nhalf-widths estimated with "
+            + (
+                "the default prior, which has the factor `told` besides"
+                if reference
+                else "the prior they are drawn from"
+            )
+        )
+        ests, true, of_s = sbc(reference=reference)
+        states, widths = hw.ranks(ests, true, bins=10), hw.Ranks.of(np.clip(of_s, 0, 1), bins=10)
+        print(f"{WINDOWS} windows of 26 rows; states: {states}")
+        for name, some in (("half-widths", of_s), ("q", of_s[:, :3]), ("r", of_s[:, 3:])):
+            print(f"{name}: {hw.Ranks.of(np.clip(some, 0, 1), bins=10)}")
+        if drawn_axes is not None:
+            kind = "default prior" if reference else "prior drawn from"
+            states.plot(drawn_axes[row, 0]).set_title(f"states, {kind}")
+            widths.plot(drawn_axes[row, 1]).set_title(f"half-widths, {kind}")
+    _save(drawn_axes, "calibration")
+
+
+def pictures():
+    """Draw coverage of windows told nothing, told all and Gaussian, and the band of a state over time."""
+    found = windows(25, WINDOWS, 7)
+    unknown = hw.Uniform.unknown(at_most=1.0)
+    gaussian = hw.Gaussian(np.full(3, Q**2 / 3)), hw.Gaussian(np.full(2, R**2 / 3))
+    prior = hw.Normal(BOX.mean, (BOX.hi - BOX.lo) ** 2 / 12)
+    thrice = hw.Gaussian(np.full(3, Q**2)), hw.Gaussian(np.full(2, R**2))
+    box = hw.Hull()
+    asked = {
+        "Posterior, told nothing": (system(unknown, unknown), hw.Posterior()),
+        "Gaussian, told the covariances": (system(*gaussian, prior, bounds=None), hw.KalmanSmoother()),
+        "Gaussian, told three times too much": (system(*thrice, prior, bounds=None), hw.KalmanSmoother()),
+        "Hull, told the half-widths": (system(hw.Uniform(Q), hw.Uniform(R)), box),
+    }
+    axes = _figure("coverage", 1, 1)
+    first = None
+    for name, (model, method) in asked.items():
+        ests = [hw.estimate(model, part, method) for _, _, part in found]
+        share = hw.coverage(ests, [x[1:] for x, _, _ in found])
+        print(f"\n{name}: {'honest' if share.honest else 'not honest'}\n{share}")
+        first = ests[0] if first is None else first
+        if axes is not None:
+            share.plot(axes[0, 0], label=name)
+    _save(axes, "coverage")
+    axes = _figure("band", 3, 1)
+    if axes is not None:
+        first.plot(found[0][0][1:], ax=axes[:, 0])
+    _save(axes, "band")
+
+
+def _figure(name, rows, columns):
+    """Return axes (rows, columns) of a figure if `PICTURES` names a folder to put it in, else None."""
+    if "PICTURES" not in os.environ:
+        return None
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    size = {"band": (8, 6)}.get(name, (5 * columns, 4.2 * rows))
+    return plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)[1]
+
+
+def _save(axes, name):
+    if axes is not None:
+        path = os.path.join(os.environ["PICTURES"], f"{name}.png")
+        axes[0, 0].figure.savefig(path, dpi=110)
+        print("wrote", path)
 
 
 def main():
     """Run what is asked for."""
     studies = {
         "table": table, "windows": windows_alone, "streams": streams, "known": against_draws, "priors": priors, "ensemble": ensemble, "outliers": outliers, "robust": robust,
-        "calibration": calibration,
+        "calibration": calibration, "pictures": pictures, "variances": variances,
     }  # fmt: skip
     for name in sys.argv[1:] or ["table"]:
         studies[name]()

@@ -76,6 +76,18 @@ class Problem {
         a.half0 = half0.data();
         a.group_w = group_w.data();
         for (std::size_t i = 0; i < n; i++) want(a.group_w[i] < a.groups, "group_w out of range");
+        if (has("group_Q")) {
+            const InInt of = typed<InInt>("group_Q");
+            want(of.size() == n, "group_Q (n,)");
+            a.group_Q = of.data();
+            for (std::size_t i = 0; i < n; i++) want(a.group_Q[i] < a.groups, "group_Q out of range");
+        }
+        if (has("group_R")) {
+            const InInt of = typed<InInt>("group_R");
+            want(of.size() == rows, "group_R (rows,)");
+            a.group_R = of.data();
+            for (std::size_t k = 0; k < rows; k++) want(a.group_R[k] < a.groups, "group_R out of range");
+        }
         a.start = start.data();
         want(a.start[0] == 0 && a.start[T + 1] == static_cast<int>(rows), "start runs from 0 to the number of rows");
         for (std::size_t t = 0; t <= T; t++) want(a.start[t] <= a.start[t + 1], "start must not fall");
@@ -107,7 +119,7 @@ class Problem {
             want(what != hw::noise_maybe_lost || a.lost, "lost is missing");
             want(a.group[k] >= 0 || what == hw::noise_gaussian || what == hw::noise_maybe_lost || what == hw::ep_truncation,
                  "a row needs a half-width");
-            want(what != hw::noise_gaussian || a.R[k] > 0, "a Gaussian row needs a variance");
+            want(what != hw::noise_gaussian || a.R[k] > 0 || (a.group_R && a.group_R[k] >= 0), "a Gaussian row needs a variance");
         }
         a.wide = nb::cast<double>(given["wide"]);
     }
@@ -215,8 +227,8 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
     return found;
 }
 
-nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale, In start, In count, bool learn_eps,
-               double rate, double start_eps, double power, double beta_a, double beta_b, In z,
+nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale, In start, In count,
+               InBool squared, bool learn_eps, double rate, double start_eps, double power, double beta_a, double beta_b, In z,
                const nb::dict& limits, std::optional<nb::tuple> before, int drop, int shaped, std::optional<In> pull,
                std::optional<In> precision, std::optional<nb::dict> outside) {
     want(z.ndim() == 2 && z.shape(0) >= 1, "z (nodes, q)");
@@ -228,12 +240,13 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     hw::EpArgs& a = p.a;
     const std::size_t stages = a.T + 1, n = a.n, rows = a.rows, groups = a.groups;
     want(free.size() == groups && floor.size() == groups && cap.size() == groups && scale.size() == groups &&
-             start.size() == groups && count.size() == groups, "one entry a half-width");
+             start.size() == groups && count.size() == groups && squared.size() == groups, "one entry a half-width");
     std::size_t q = learn_eps ? 1 : 0;
     for (std::size_t g = 0; g < groups; g++) q += free.data()[g] ? 1 : 0;
     want(q <= std::size_t(hw::ep_free), "at most 16 free parameters");
     want(z.shape(1) == q, "z (nodes, q)");
     l.free = free.data();
+    l.squared = squared.data();
     l.floor = floor.data();
     l.cap = cap.data();
     l.scale = scale.data();
@@ -332,6 +345,9 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     found["sd"] = fresh({groups}, &l.sd);
     found["lo"] = fresh({groups}, &l.quantile_lo, floor.data());
     found["hi"] = fresh({groups}, &l.quantile_hi, floor.data());
+    for (std::size_t g = 0; g < groups; g++)
+        if (squared.data()[g])
+            for (double* v : {l.mean, l.quantile_lo, l.quantile_hi}) v[g] *= v[g];
     found["told_pull"] = fresh({groups}, &l.told_pull);
     found["told_precision"] = fresh({groups, groups}, &l.told_precision);
     found["edge_x"] = fresh({stages, n}, &l.edge_x);
@@ -386,7 +402,8 @@ void bind_ep(nb::module_& mod) {
             "Expectation propagation on a chain for given half-widths, one set a member; see core/ep_entry.hpp.");
     mod.def("ep_known", &known, "free"_a, "pull"_a, "precision"_a,
             "What is known of the free half-widths alone, whatever the others are; see core/ep_handover.hpp.");
-    mod.def("ep_learn", &learn, "problem"_a, "free"_a, "floor"_a, "cap"_a, "scale"_a, "start"_a, "count"_a, "learn_eps"_a,
+    mod.def("ep_learn", &learn, "problem"_a, "free"_a, "floor"_a, "cap"_a, "scale"_a, "start"_a, "count"_a,
+            "squared"_a, "learn_eps"_a,
             "rate"_a, "start_eps"_a, "power"_a, "beta_a"_a, "beta_b"_a, "z"_a, "limits"_a,
             "before"_a.none() = nb::none(), "drop"_a = 0, "shaped"_a = 0, "pull"_a.none() = nb::none(), "precision"_a.none() = nb::none(),
             "outside"_a.none() = nb::none(),

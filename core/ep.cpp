@@ -210,7 +210,13 @@ int ep_learn(const EpLearnArgs& given) {
     const int q = static_cast<int>(learner_parameters(a));
     ep_widths(a, q, rest);
     ep_told(a, q, rest);
-    ep_edge(a.base, a.base.m, a.base.D, a.base.tau, a.base.nu, a.edge_x, a.edge_P, rest);
+    double own[ep_states] = {};
+    for (int g = 0, j = 0; g < p && a.base.group_Q; g++) {
+        const double s = a.free[g] ? std::exp(a.mode[j++]) : a.start[g];
+        for (int i = 0; i < a.base.n; i++)
+            if (a.base.group_Q[i] == g) own[i] = s * s;
+    }
+    ep_edge(a.base, own, a.base.m, a.base.D, a.base.tau, a.base.nu, a.edge_x, a.edge_P, rest);
     return code;
 }
 

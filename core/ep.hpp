@@ -183,9 +183,14 @@ struct Ep {
     inline bool has_site(int t, int i) const { return t == 0 ? a.half0[i] > 0.0 : a.group_w[i] >= 0; }
     inline V width(int t, int i) const { return t == 0 ? V(a.half0[i]) : s.s[a.group_w[i]]; }
 
-    // variance of a row's Gaussian part: its own, and what unseen correlated outputs add
+    // variance of the Gaussian part of w_i that has a group of its own
+    inline bool fitted(int i) const { return a.group_Q && a.group_Q[i] >= 0; }
+    inline V power(int i) const { return s.s[a.group_Q[i]] * s.s[a.group_Q[i]]; }
+
+    // variance of a row's Gaussian part: its own, what its group has, and what unseen correlated outputs add
     inline V variance(int k) const {
         V R(a.R[k]);
+        if (a.group_R && a.group_R[k] >= 0) R += s.s[a.group_R[k]] * s.s[a.group_R[k]];
         if (a.mix)
             for (int g = 0; g < a.groups; g++)
                 if (a.mix[static_cast<std::ptrdiff_t>(k) * a.groups + g] != 0.0)
@@ -230,7 +235,7 @@ struct Ep {
         for (int k = 0; k < a.rows; k++) {
             s.nu[k] = V(0.0);
             if (kind(k) == noise_gaussian) {
-                s.tau[k] = V(1.0 / a.R[k]);
+                s.tau[k] = V(1.0) / variance(k);
             } else if (kind(k) >= noise_contaminated) {  // bounds, and rows that may say nothing: not until they are asked
                 s.tau[k] = V(0.0);
             } else {
@@ -239,6 +244,15 @@ struct Ep {
             }
         }
         forget();
+    }
+
+    // Gaussian rows are their own sites, whatever they were taken from
+    void fix() {
+        for (int k = 0; k < a.rows && (a.group_R || a.mix); k++)
+            if (kind(k) == noise_gaussian) {
+                s.tau[k] = V(1.0) / variance(k);
+                s.nu[k] = V(0.0);
+            }
     }
 
     // no message from the future
@@ -265,6 +279,11 @@ struct Ep {
         else
             for (int i = 0; i < n * n; i++) Q[i] = V(0.0);
         for (int i = 0; i < n; i++) d[i] = block.load(a.b, static_cast<std::ptrdiff_t>(t - 1) * n + i);
+        V own[cap];
+        if (a.group_Q) {
+            for (int i = 0; i < n; i++) own[i] = fitted(i) ? D[i] + power(i) : D[i];
+            D = own;
+        }
         if (a.G.data) {
             for (int i = 0; i < n; i++)
                 for (int k = 0; k < n; k++) {
@@ -328,7 +347,8 @@ struct Ep {
             if constexpr (!renew) {
                 f.top += densest(k);
                 if (kind(k) == noise_gaussian) {
-                    f.log_z -= V(0.5) * V(log_2pi + std::log(a.R[k]));
+                    f.log_z -= V(0.5) * (V(log_2pi) + log_of(variance(k)));
+                    if (a.group_R || a.mix) gaussian_slopes(k, h, ms, Ps, f);
                     if (cross.S) cross.r3[k] = cross.r4[k] = V(0.0);
                 }
             }
@@ -349,6 +369,20 @@ struct Ep {
             }
             fold<renew>(k, h, mf, Pf, f);
         }
+    }
+    // d log Z / d log R = ((z^2 + v) / R - 1) / 2 of a Gaussian row whose residual has the posterior N(z, v)
+    inline void gaussian_slopes(int k, const V* h, const V* ms, const V* Ps, EpFound& f) const {
+        V z = -target(k), v(0.0);
+        for (int i = 0; i < n; i++) {
+            V q(0.0);
+            for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
+            v += h[i] * q;
+            z += h[i] * ms[i];
+        }
+        Tilted<X> q{};
+        const V R = variance(k);
+        q.slope_R = (V(0.5) * ((z * z + v) / R - V(1.0))).v;
+        slopes(k, q, v, f);
     }
     // both ends of a bound out of reach in every lane
     inline bool far_inside(int k, const V& z, const V& v) const {
@@ -442,6 +476,13 @@ struct Ep {
             const V own = s.s[a.group[k]] * s.s[a.group[k]] * V(1.0 / 3.0), all = larger(own + variance(k), V(1e-300));
             const V share = larger(V(1.0) - v / all, V(0.0)) * own / all;
             f.learned[a.group[k]] += share * share;
+        }
+        if (a.group_R && a.group_R[k] >= 0) {
+            const V own = s.s[a.group_R[k]] * s.s[a.group_R[k]], R = larger(variance(k), V(1e-300));
+            const V box = a.group[k] >= 0 ? s.s[a.group[k]] * s.s[a.group[k]] * V(1.0 / 3.0) : V(0.0), all = box + R;
+            f.slope[a.group_R[k]] += of(q.slope_R) * V(2.0) * own / R;
+            const V share = larger(V(1.0) - v / all, V(0.0)) * own / all;
+            f.learned[a.group_R[k]] += share * share;
         }
         if (a.mix) {
             const V R = larger(variance(k), V(1e-300));
@@ -565,6 +606,7 @@ struct Ep {
 
     // the future's messages of the sites as they are
     void hear() {
+        fix();
         V A[cap * cap], G[cap * cap] = {}, Lambda[cap * cap], eta[cap], U[cap * cap];
         for (int i = 0; i < n; i++) s.eb[a.T * n + i] = V(0.0);
         for (int i = 0; i < packed(); i++) s.Lb[a.T * packed() + i] = V(0.0);
@@ -853,6 +895,12 @@ struct Ep {
     inline void sites(int t, V* W, V* r, EpFound& f) {
         V *m = s.m + t * n, *D = s.D + t * n;
         for (int i = 0; i < n; i++) {
+            if constexpr (!renew)
+                if (t > 0 && fitted(i)) {  // g_i has the posterior mean p r_i and variance p - p W_ii p
+                    const V p = power(i), share = p * W[i * n + i];
+                    f.slope[a.group_Q[i]] += p * r[i] * r[i] - share;
+                    f.learned[a.group_Q[i]] += share * share;
+                }
             if (!has_site(t, i)) {
                 if (!renew && cross.S) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
                 continue;

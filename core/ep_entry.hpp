@@ -28,12 +28,15 @@ struct EpArgs {
     EpStack b;        // (T,n)
     const double *m0, *P0, *half0;  // (n,), (n,n), (n,): x_0 = N(m0, P0) + uniform on +- half0 (0: none)
     const std::int32_t* group_w;    // (n,): half-width of w_i; -1: no uniform part
+    // groups that are standard deviations, for what is found by evidence; -1 none; null: none at all
+    const std::int32_t* group_Q;    // (n,): of an independent Gaussian part of w_i, beside Q
+    const std::int32_t* group_R;    // (rows,): of the Gaussian part, beside R
     // rows of stage t are start[t] .. start[t+1]-1
     const std::int32_t* start;  // (T+2,)
     EpStack h, y;               // (rows,n), (rows,): residual h'x - y
     const std::int8_t* kind;    // (rows,): NoiseKind or ep_truncation
     const std::int32_t* group;  // (rows,): half-width; -1: 0
-    const double* R;            // (rows,): variance of the Gaussian part, above 0 for noise_gaussian
+    const double* R;            // (rows,): variance of the Gaussian part, above 0 for noise_gaussian unless group_R has it
     const double *lo, *hi;      // (rows,): of truncations
     const double* lost;         // (rows,): log density of a lost row, or null
     const double* mix;          // (rows,groups): variance added, in units of s^2, or null
@@ -71,7 +74,7 @@ struct EpLearnArgs {
     EpArgs base;
     const EpArgs* outside;                   // the chain with its bounds alone, or null
     double condition;                        // power of its evidence that the chain's is divided by
-    const bool* free;                        // (groups,)
+    const bool *free, *squared;              // (groups,): free ones; those of which the square is told: variances
     const double *floor, *cap, *scale;       // (groups,): bounds, and the order of size
     const double* start;                     // (groups,): first guess, and the half-widths that `before` belongs to
     const EpBefore* before;                  // sites to start from; or null
@@ -96,7 +99,7 @@ struct EpLearnArgs {
     double *log_evidence, *log_mode, *log_prior, *residual;  // of the data; Z times prior, and the prior, at the mode
     std::int32_t* used;                      // nodes
     long* sweeps_used;
-    double *mean, *sd, *quantile_lo, *quantile_hi;           // (groups,), only the free ones written: half-widths
+    double *mean, *sd, *quantile_lo, *quantile_hi;           // (groups,), only the free ones written: half-widths, variances
     double *found_rate, *effective;                          // rate of outliers; effective number of nodes
     double *told_pull, *told_precision;                      // (groups,), (groups,groups): what the rows tell
     double *edge_x, *edge_P;                                 // (T+1,n), (T+1,n,n): x_t given what lies up to t

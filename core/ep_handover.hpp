@@ -153,7 +153,8 @@ inline void ep_widths(const EpLearnArgs& a, int q, double* work) {
     int j = 0;
     for (int g = 0; g < p; g++) {
         if (!a.free[g]) continue;
-        const auto s = [&](int k) { return std::exp(a.phi[k * q + j]); };
+        const double power = a.squared[g] ? 2.0 : 1.0;
+        const auto s = [&](int k) { return std::exp(power * a.phi[k * q + j]); };
         double m = 0.0, v = 0.0;
         for (int k = 0; k < K; k++) m += w[k] * s(k);
         for (int k = 0; k < K; k++) v += w[k] * (s(k) - m) * (s(k) - m);
@@ -161,7 +162,7 @@ inline void ep_widths(const EpLearnArgs& a, int q, double* work) {
             double column[ep_free] = {};
             column[j] = 1.0;
             ldl_solve(Dim<0>(q), Dim<1>(), L, inverse, column);
-            v = m * m * column[j];
+            v = power * power * m * m * column[j];
         }
         a.mean[g] = m;
         a.sd[g] = std::sqrt(v);
@@ -187,8 +188,8 @@ inline void ep_widths(const EpLearnArgs& a, int q, double* work) {
                     break;
                 }
             }
-            a.quantile_lo[g] = std::exp(at(low < 0 ? high : low));
-            a.quantile_hi[g] = std::exp(at(high));
+            a.quantile_lo[g] = std::exp(power * at(low < 0 ? high : low));
+            a.quantile_hi[g] = std::exp(power * at(high));
         }
         j++;
     }
@@ -274,9 +275,9 @@ inline void ep_told(const EpLearnArgs& a, int q, double* work) {
     }
 }
 
-// Mean (T+1,n) and covariance (T+1,n,n) of x_t given what lies up to t, by the sites m, D, tau, nu of member 0.
-// work (4 n^2 + 2 n)
-inline void ep_edge(const EpArgs& a, const double* m, const double* D, const double* tau, const double* nu, double* found_x,
+// Mean (T+1,n) and covariance (T+1,n,n) of x_t given what lies up to t, by the sites m, D, tau, nu of member 0; own (n,):
+// variances of what w has besides. work (4 n^2 + 2 n)
+inline void ep_edge(const EpArgs& a, const double* own, const double* m, const double* D, const double* tau, const double* nu, double* found_x,
                     double* found_P, double* work) {
     const int n = a.n;
     double *AP = work, *GD = AP + n * n, *x = GD + n * n, *P = x + n, *Ph = P + n * n;
@@ -295,7 +296,7 @@ inline void ep_edge(const EpArgs& a, const double* m, const double* D, const dou
                 for (int j = 0; j < n; j++) {
                     x[i] += A[i * n + j] * before[j];
                     if (G) x[i] += G[i * n + j] * mt[j];
-                    GD[i * n + j] = G ? G[i * n + j] * Dt[j] : 0.0;
+                    GD[i * n + j] = G ? G[i * n + j] * (Dt[j] + own[j]) : 0.0;
                     double s = 0.0;
                     for (int k = 0; k < n; k++) s += A[i * n + k] * P[k * n + j];
                     AP[i * n + j] = s;
@@ -304,7 +305,7 @@ inline void ep_edge(const EpArgs& a, const double* m, const double* D, const dou
             const double* Q = a.Q.data ? at(a.Q, t - 1) : nullptr;
             for (int i = 0; i < n; i++)
                 for (int j = 0; j < n; j++) {
-                    double s = (Q ? Q[i * n + j] : 0.0) + (!G && i == j ? Dt[i] : 0.0);
+                    double s = (Q ? Q[i * n + j] : 0.0) + (!G && i == j ? Dt[i] + own[i] : 0.0);
                     for (int k = 0; k < n; k++) s += AP[i * n + k] * A[j * n + k] + (G ? GD[i * n + k] * G[j * n + k] : 0.0);
                     P[i * n + j] = s;
                 }
@@ -361,7 +362,8 @@ inline bool ep_moved(const EpLearnArgs& a) {
             b.nu[k] = w.nu[there + k - low];
         } else {
             const double s = b.group[k] >= 0 ? a.start[b.group[k]] : 0.0;
-            b.tau[k] = b.kind[k] < noise_contaminated ? 1.0 / max2(s * s / 3.0 + b.R[k], 1e-300) : 0.0;
+            const double r = b.group_R && b.group_R[k] >= 0 ? a.start[b.group_R[k]] : 0.0;
+            b.tau[k] = b.kind[k] < noise_contaminated ? 1.0 / max2(s * s / 3.0 + r * r + b.R[k], 1e-300) : 0.0;
             b.nu[k] = 0.0;
         }
     }

@@ -87,6 +87,9 @@ def _cases():
     truth, record = hw.simulate(unknown, u, seed=5)
     model = dataclasses.replace(unknown, w=hw.Uniform.unknown(at_most=5.0), e=hw.Uniform.unknown(at_most=5.0))
     found.append(Case("oscillator unknown", model, truth, holes(record, 6, 0.2)))
+    truth, record = hw.simulate(oscillator(hw.Gaussian([0.1, 0.2, 0.1]), hw.Gaussian([0.3, 0.4]), ball), u, seed=8)
+    unknown = hw.Gaussian.unknown(at_most=25.0)
+    found.append(Case("oscillator unknown variances", oscillator(unknown, unknown, ball), truth, holes(record, 9, 0.2)))
     bounded = dataclasses.replace(
         oscillator(hw.Gaussian([0.1, 0.2, 0.1]), hw.Gaussian([0.3, 0.4]), ball),
         bounds=hw.Box([-2.7, -2.7, -2.1], [0.6, 3.2, np.inf]),

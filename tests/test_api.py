@@ -8,12 +8,12 @@ import halfwidth as hw
 
 NAMES = """
 BKF1 BKF2 BadLog BadRecord BadShape BadValue BatchLP BeamSearch Bernoulli Both Bound Box Cloud Comparison
-Constrained ConstrainedZonotopeFilter DataQualityWarning EllipsoidFilter Estimate Estimator ExtendedKalman
+Constrained ConstrainedZonotopeFilter Coverage DataQualityWarning EllipsoidFilter Estimate Estimator ExtendedKalman
 FearnheadClifford GPB Gaussian Halfspaces HalfwidthError Hull IntervalFilter KalmanFilter KalmanSmoother Learned
 Linear LogTooBig Markov MemoryChoice Missing Mixed MixedFilter MixedWindow Nonlinear Normal ParticleFilter Posterior
-RBPF Record Recursive Refused Runnalls SequentialLP Shaped Status Uniform UnscentedKalman Unsolved Window
-ZonotopeFilter __version__ bound choose_memory compare ensemble_interval estimate forecast from_continuous learn
-resume score simulate stream
+RBPF Ranks Record Recursive Refused Runnalls SequentialLP Shaped Status Uniform UnscentedKalman Unsolved Window
+ZonotopeFilter __version__ bound choose_memory compare coverage ensemble_interval estimate forecast from_continuous learn
+ranks resume score simulate stream
 """
 
 

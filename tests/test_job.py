@@ -124,6 +124,7 @@ def test_a_wrong_model_names_its_key(changes, words):
 def test_all_kinds_of_noise_and_priors():
     assert isinstance(linear(spec(w={"uniform": [0.1, 0.2]})).w, hw.Uniform)
     assert isinstance(linear(spec(w={"uniform": 0.1, "gaussian": 0.2})).w, hw.Mixed)
+    assert not linear(spec(w={"gaussian": {"at_most": 4.0}})).w.known
     assert not linear(spec(w={"at_most": [1.0, 2.0]})).w.known
     assert isinstance(linear(spec(x0={"lo": [0, 0], "hi": [1, 1]})).x0, hw.Box)
     bounded = linear(spec(bounds={"lo": [-9, -9], "hi": [9, 9]}, E=[[1, 0.1], [0, 1]], x0=None))

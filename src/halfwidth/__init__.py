@@ -36,6 +36,10 @@ _HOME: dict[str, str] = {
     "estimate": "estimate",
     "simulate": "simulate",
     "score": "score",
+    "coverage": "coverage",
+    "Coverage": "coverage",
+    "ranks": "coverage",
+    "Ranks": "coverage",
     "stream": "stream",
     "resume": "stream",
     "forecast": "forecast",
@@ -67,6 +71,10 @@ __all__ = ["__version__", *sorted(_HOME)]
 if TYPE_CHECKING:
     from halfwidth.bound import bound as bound
     from halfwidth.continuous import from_continuous as from_continuous
+    from halfwidth.coverage import Coverage as Coverage
+    from halfwidth.coverage import Ranks as Ranks
+    from halfwidth.coverage import coverage as coverage
+    from halfwidth.coverage import ranks as ranks
     from halfwidth.errors import BadLog as BadLog
     from halfwidth.errors import BadRecord as BadRecord
     from halfwidth.errors import BadShape as BadShape

@@ -80,6 +80,8 @@ def forecast(
         est.method,
         q=est.q,
         r=est.r,
+        Q=est.Q,
+        R=est.R,
         theta=est.theta,
         loglik=est.loglik,
         names=est.names,

@@ -15,7 +15,7 @@ A model as plain data has the keys of `hw.Linear`::
     A = [[1, 0.1], [0, 1]]
     B = [[0.005], [0.1]]
     C = [[1, 0]]
-    w = { gaussian = [1e-4, 1e-3] }  # or uniform = [...], or both, or at_least/at_most = [...]
+    w = { gaussian = [1e-4, 1e-3] }  # or uniform = [...], or both, or at_least/at_most = [...]; unknown: gaussian = {}
     e = { uniform = 0.5 }
     x0 = { mean = [0, 0], covariance = [[1, 0], [0, 1]] }   # or { lo = [...], hi = [...] }
     bounds = { lo = [...], hi = [...] }                     # of every state, or of D x with D = [[...]]; optional
@@ -294,7 +294,12 @@ def _noise(data: Mapping[str, Any], key: str) -> "Noise":
                 raise BadValue("`uniform` and `at_least`, `at_most` are both given, one is expected")
             parts.append(Uniform.unknown(table.get("at_least", 0.0), table.get("at_most", float("inf"))))
         if "gaussian" in table:
-            parts.append(Gaussian(table["gaussian"]))
+            own = table["gaussian"]
+            if isinstance(own, Mapping):
+                ends = _table(table, "gaussian", ("at_least", "at_most"))
+                parts.append(Gaussian.unknown(ends.get("at_least", 0.0), ends.get("at_most", float("inf"))))
+            else:
+                parts.append(Gaussian(own))
         if not parts:
             raise BadValue(f"the table is empty, one of {', '.join(_NOISE_KEYS)} is expected")
         noise: Noise = parts[0] if len(parts) == 1 else parts[0] + parts[1]

@@ -515,6 +515,9 @@ def _names(given: Sequence[str] | Mapping[str, Sequence[str]] | Names | None, nx
 
 
 def _gaussian(noise: Noise, name: str) -> Gaussian:
+    part = noise.gaussian if isinstance(noise, Mixed) else noise
+    if isinstance(part, Gaussian) and not part.known:
+        raise Refused(f"`{name}` has unknown variances, so it has no covariance", hint=f"give {name}=Gaussian(Q)")
     if isinstance(noise, Gaussian):
         return noise
     if not noise.known:

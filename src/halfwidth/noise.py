@@ -1,4 +1,4 @@
-"""What disturbs: uniform noise with known or unknown half-widths, Gaussian noise, and their sum.
+"""What disturbs: uniform noise with known or unknown half-widths, Gaussian with known or unknown variances, their sum.
 
 A noise is a frozen value without an owner: a scalar parameter takes its size from the model it is given to.
 """
@@ -78,17 +78,10 @@ class Uniform:
         at_least, at_most : scalar or (n,) array_like
             Equal ends mean a known half-width.
         """
-        lo, hi = extended(at_least, "at_least"), extended(at_most, "at_most")
-        if lo.ndim > 1 or hi.ndim > 1:
-            raise BadShape(f"`at_least` and `at_most` have shapes {lo.shape}, {hi.shape}: scalar or (n,)")
-        if np.any(lo < 0) or np.any(np.isinf(lo)):
-            raise BadValue(f"`at_least` is {at_least!r}, finite numbers not below 0 were expected")
-        if np.any(lo > hi):
-            raise BadValue(f"`at_least` {at_least!r} exceeds `at_most` {at_most!r}")
+        lo, hi = _between(at_least, at_most)
         noise = object.__new__(cls)
-        shape = np.broadcast_shapes(lo.shape, hi.shape)
-        object.__setattr__(noise, "at_least", frozen(np.array(np.broadcast_to(lo, shape))))
-        object.__setattr__(noise, "at_most", frozen(np.array(np.broadcast_to(hi, shape))))
+        object.__setattr__(noise, "at_least", lo)
+        object.__setattr__(noise, "at_most", hi)
         return noise
 
     @property
@@ -152,13 +145,18 @@ class Gaussian:
     >>> Gaussian([1.0, 4.0]).cov().single
     array([[1., 0.],
            [0., 4.]])
+    >>> Gaussian.unknown(at_most=4.0).known
+    False
     """
 
-    Q: Varying | Array
-    known = True
+    Q: Varying | Array | None
+    at_least: Array | None
+    at_most: Array | None
 
     def __init__(self, Q: ArrayLike | Function | Varying) -> None:
         value: Varying | Array
+        if Q is None:
+            raise BadValue("`Q` is None, a covariance was expected", hint="Gaussian.unknown() has it estimated")
         if isinstance(Q, Varying):
             value = Q
         elif callable(Q):
@@ -171,18 +169,55 @@ class Gaussian:
                 value = frozen(value) if value.ndim == 0 else varying(np.diag(value), "Q", (None, None))
             else:
                 value = varying(value, "Q", (value.shape[-1], value.shape[-1]), check=covariance)
-        object.__setattr__(self, "Q", value)
+        self._set(value, None, None)
+
+    def _set(self, Q: Varying | Array | None, at_least: Array | None, at_most: Array | None) -> None:
+        for name, value in (("Q", Q), ("at_least", at_least), ("at_most", at_most)):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def unknown(cls, at_least: ArrayLike = 0.0, at_most: ArrayLike = np.inf) -> "Gaussian":
+        """Return independent Gaussian noise whose variances are to be estimated between these bounds.
+
+        Parameters
+        ----------
+        at_least, at_most : scalar or (n,) array_like
+            Variances. Equal ends mean a known one.
+        """
+        lo, hi = _between(at_least, at_most)
+        if np.all(lo == hi):
+            return cls(lo)
+        noise = object.__new__(cls)
+        noise._set(None, lo, hi)
+        return noise
+
+    @property
+    def known(self) -> bool:
+        """Whether the covariance is given."""
+        return self.Q is not None
 
     def sized(self, n: int, name: str) -> "Gaussian":
         """Return the noise with `n` entries."""
+        if self.at_least is not None and self.at_most is not None:
+            return Gaussian.unknown(
+                of_size(self.at_least, n, name, "the model"), of_size(self.at_most, n, name, "the model")
+            )
         if not isinstance(self.Q, Varying):
-            return Gaussian(np.full(n, float(self.Q)))
+            return Gaussian(np.full(n, self.Q))
         if self.Q.shape != (n, n):
             raise BadShape(f"`{name}` has a covariance of shape {self.Q.shape}, ({n}, {n}) was expected")
         return self if self.Q.name == f"{name}.Q" else Gaussian(replace(self.Q, name=f"{name}.Q"))
 
     def cov(self) -> Varying:
-        """Return the covariance (n, n)."""
+        """Return the covariance (n, n).
+
+        Raises
+        ------
+        Refused
+            If it is unknown.
+        """
+        if self.Q is None:
+            raise Refused("the variances of `Gaussian.unknown(...)` are not known", hint="Gaussian(Q), or Posterior()")
         if isinstance(self.Q, Varying):
             return self.Q
         return varying(np.atleast_2d(self.Q), "Q", (None, None))
@@ -200,6 +235,8 @@ class Gaussian:
         return _mixed(other, self)
 
     def __repr__(self) -> str:
+        if self.at_least is not None and self.at_most is not None:
+            return f"Gaussian.unknown(at_least={_show(self.at_least)}, at_most={_show(self.at_most)})"
         if isinstance(self.Q, Varying):
             return f"Gaussian({_show(self.Q.value) if self.Q.constant else 'varying'})"
         return f"Gaussian({_show(self.Q)})"
@@ -214,8 +251,8 @@ class Mixed:
 
     @property
     def known(self) -> bool:
-        """Whether the half-widths are given."""
-        return self.uniform.known
+        """Whether the half-widths and the covariance are given."""
+        return self.uniform.known and self.gaussian.known
 
     def sized(self, n: int, name: str) -> "Mixed":
         """Return the noise with `n` entries."""
@@ -237,6 +274,31 @@ class Mixed:
 
     def __repr__(self) -> str:
         return f"{self.uniform!r} + {self.gaussian!r}"
+
+
+def _between(at_least: ArrayLike, at_most: ArrayLike) -> tuple[Array, Array]:
+    """Return the two ends of what is unknown, of one shape, checked."""
+    lo, hi = extended(at_least, "at_least"), extended(at_most, "at_most")
+    if lo.ndim > 1 or hi.ndim > 1:
+        raise BadShape(f"`at_least` and `at_most` have shapes {lo.shape}, {hi.shape}: scalar or (n,)")
+    if np.any(lo < 0) or np.any(np.isinf(lo)):
+        raise BadValue(f"`at_least` is {at_least!r}, finite numbers not below 0 were expected")
+    if np.any(lo > hi):
+        raise BadValue(f"`at_least` {at_least!r} exceeds `at_most` {at_most!r}")
+    shape = np.broadcast_shapes(lo.shape, hi.shape)
+    return frozen(np.array(np.broadcast_to(lo, shape))), frozen(np.array(np.broadcast_to(hi, shape)))
+
+
+def unknown_variances(w: Noise, e: Noise, name: str) -> str | None:
+    """Return why a method that is told all Gaussian noise cannot take this one, with a hint, or None."""
+    for symbol, noise in (("w", w), ("e", e)):
+        part = noise.gaussian if isinstance(noise, Mixed) else noise
+        if isinstance(part, Gaussian) and not part.known:
+            return (
+                f"`{name}` needs known variances but those of `{symbol}` are unknown"
+                f"\nhint: Posterior(), which finds them, or {symbol}=Gaussian(Q)"
+            )
+    return None
 
 
 def _mixed(uniform: object, gaussian: object) -> Mixed:

@@ -47,6 +47,8 @@ class Estimate:
         The estimator with its settings, as it would be typed.
     q, r : (nx,) and (ny,) arrays or None
         Half-widths of the noise of state and output.
+    Q, R : (nx,) and (ny,) arrays or None
+        Variances of their Gaussian parts, where they were unknown.
     theta : (n_theta,) array or None
         Unknown entries of the model, in the order of ``model.theta_entries``.
     gamma : (T,) or (T, ny) array or None
@@ -74,6 +76,8 @@ class Estimate:
     names: tuple[str, ...] = ()
     labels: Labels = field(default_factory=Labels, repr=False)
     info: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    Q: Array | None = None
+    R: Array | None = None
 
     @property
     def guaranteed(self) -> bool:

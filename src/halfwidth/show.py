@@ -36,7 +36,7 @@ def summary(estimate: "Estimate", level: float) -> str:
         lines.append(text + (f"  {np.median(half[:, i]):>20.3g}" if half is not None else ""))
     if len(names) > _SHOWN:
         lines.append(f"... and {len(names) - _SHOWN} more states")
-    for symbol in ("q", "r", "theta"):
+    for symbol in ("q", "r", "Q", "R", "theta"):
         value = getattr(estimate, symbol)
         if value is not None and np.size(value):
             lines.append(f"{symbol} = {np.array2string(np.asarray(value), precision=4)}")

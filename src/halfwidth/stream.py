@@ -323,7 +323,8 @@ def _method(name: str, settings: dict[str, Any]) -> Any:
 def _model_to_json(model: Model) -> dict[str, Any] | None:
     if not isinstance(model, Linear) or not isinstance(model.x0, Normal) or model.loss is not None:
         return None
-    if not isinstance(model.w, Gaussian) or not isinstance(model.e, Gaussian) or model.bounds is not None:
+    gaussian = isinstance(model.w, Gaussian) and isinstance(model.e, Gaussian)
+    if not gaussian or not (model.w.known and model.e.known) or model.bounds is not None:
         return None
     varying = {**model.matrices, "Q": model.w.cov(), "R": model.e.cov()}
     if not all(m.constant for m in varying.values()):

@@ -46,6 +46,7 @@ GAUSSIAN = [
     (m, c)
     for m, c in LINEAR
     if isinstance(c.model.w, hw.Gaussian) and isinstance(c.model.e, hw.Gaussian) and getattr(m, "by", "") != "nearest"
+    if c.model.w.known
 ]
 
 
@@ -83,6 +84,8 @@ def _scaled(thing, s):
         return None
     if isinstance(thing, hw.Halfspaces):
         return hw.Halfspaces(thing.D, s * thing.lo, s * thing.hi)
+    if isinstance(thing, hw.Gaussian) and not thing.known:
+        return hw.Gaussian.unknown(s**2 * thing.at_least, s**2 * thing.at_most)
     if isinstance(thing, hw.Gaussian):
         return hw.Gaussian(s**2 * thing.cov().single)
     if isinstance(thing, hw.Uniform):

@@ -1,13 +1,13 @@
 """What `Window(Posterior())` hands on when rows leave: the state at its edge, and what is known of half-widths."""
 
+import halfwidth._core as _core
 import numpy as np
 import pytest
+from tests import naive_carry
 
 import halfwidth as hw
-import halfwidth._core as _core
 from halfwidth.methods._carry import WARP, Carried, Known, Start, inside
 from halfwidth.methods._sites import sites
-from tests import naive_carry
 
 A = np.array([[1, -0.5, 0.2], [0.5, 0.1, 0], [0.3, 0, -0.1]])
 C = np.array([[1, 0, 0.5], [0, 1, 0.5]])

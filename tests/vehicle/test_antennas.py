@@ -10,6 +10,7 @@ import halfwidth as hw
 from halfwidth.vehicle import antennas, models
 from halfwidth.vehicle.antennas import TwoAntennas, limits_of, parsed_limits
 from halfwidth.vehicle.drive import simulate_drive
+from halfwidth.vehicle.estimators import with_limits
 from halfwidth.vehicle.fill import fill
 from halfwidth.vehicle.grid import sampled
 from halfwidth.vehicle.roads import Roads
@@ -252,6 +253,9 @@ def test_fill_takes_them_all(tmp_path, drive):
     assert any("on their floor" in message for message in track.messages)
     with pytest.raises(hw.BadValue, match="two-antenna"):
         fill(log, method="em", limits={"speed": 20})
+    with pytest.raises(hw.BadValue, match="`paper002` does not estimate"):
+        fill(log, method="paper002", limits={"altitude": (0, 500)})
+    assert with_limits(None, {"altitude": (0, 500)}, None).name == "paper002-3d"
     with pytest.raises(hw.BadValue, match="map"):
         fill(log, roads=tmp_path / "none.geojson")
 

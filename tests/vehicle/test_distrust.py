@@ -90,7 +90,10 @@ def test_jumps_of_a_simulated_drive():
     found = distrusted(bad_log)
     assert np.isin(jumped, found.of("jump")).mean() >= 0.95
     assert len(np.setdiff1d(found.rows, jumped)) <= 0.002 * rows.size
-    item = vehicle.check(bad_log)["trust"]
+    item = vehicle.check(bad_log)["stray fixes"]  # as `fill` does: the sensors say it where there are any
+    assert item.verdict == "warn"
+    assert "cannot have been" in item.sentence
+    item = vehicle.check(dataclasses.replace(bad_log, speed_mps=np.full(len(log), np.nan)))["trust"]
     assert item.verdict == "warn"
     assert "off the path" in item.sentence
     assert len(distrusted(log)) <= 0.002 * rows.size

@@ -181,6 +181,23 @@ def test_benchmark_of_this_very_log_is_shown_and_said_first():
     assert "Tested on this very log" not in Reader(page(made_track())).text()
 
 
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        ((0.31, 0.63), "before half-widths were narrowed, to 0.31 times, so that 90 % do."),
+        ((1.0, 2.04), "before half-widths were widened, up to 2.0 times, so that 90 % do."),
+        ((0.5, 1.5), "before half-widths were narrowed or widened, 0.5 to 1.5 times, so that 90 % do."),
+        ((0.98, 1.02), "90 % of them lay inside."),
+    ],
+)
+def test_it_is_said_what_hidden_fixes_made_of_the_half_widths(factors, words):
+    rows = [
+        {"method": "em_chain", "length_s": 10.0 * k, "stretches": 9, "mean_m": 0.2, "coverage": 0.9, "inflation": f}
+        for k, f in enumerate(factors, 1)
+    ]
+    assert words in Reader(page(made_track(benchmark=rows))).text().replace("\u00a0", " ")
+
+
 def test_faults_of_the_log_are_named():
     t = np.arange(120) / 10
     text = Reader(page(made_track())).text()

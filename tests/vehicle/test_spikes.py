@@ -49,6 +49,28 @@ def test_a_stuck_sensor_that_leaps_is_found_and_a_cruise_is_not():
     assert "the speed is stuck and then leaps" in spikes(stuck).words(stuck)[0]
 
 
+@pytest.mark.parametrize("rate", [10.0, 1.0])
+def test_a_sensor_is_stuck_for_longer_than_it_ever_holds_a_value(rate):
+    """The leap at the end is one that a car can make."""
+    _, log = simulate_drive(duration=400, seed=4, tunnels=(), rate=rate)
+    assert len(spikes(log)) == 0
+    n = round(10 * rate) if rate > 1 else 20
+    change = np.abs(log.speed_mps[n:] - log.speed_mps[:-n])
+    moving = np.flatnonzero((log.speed_mps[:-n] > 3) & (change > 1.5) & (change < 3.0))
+    rows = np.arange(moving[0], moving[0] + n)
+    stuck = with_samples(log, "speed_mps", rows, log.speed_mps[rows[0]])
+    (found,) = spikes(stuck).stuck["speed_mps"]
+    assert found[-1] == rows[-1]
+    assert found.size >= 0.9 * n
+
+
+@pytest.mark.parametrize("seed", range(20, 24))
+@pytest.mark.parametrize(("rate", "step"), [(50.0, 1 / 3.6), (10.0, 0.25), (1.0, 1 / 3.6)])
+def test_coarse_streams_hold_their_values_in_peace(seed, rate, step):
+    _, log = simulate_drive(duration=400, seed=seed, tunnels=(), rate=rate, speed_step=step, yaw_step=0.01)
+    assert len(spikes(log)) == 0
+
+
 @pytest.mark.parametrize("name", ["smartloc", "balzer", "driveplotr"])
 def test_real_logs_are_left_in_peace(data, name):
     log = read(next(data.glob(f"{name}*.csv.gz")))

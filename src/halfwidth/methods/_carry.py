@@ -28,7 +28,6 @@ import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import halfwidth._core as _core
 from halfwidth.array import Array
@@ -114,7 +113,7 @@ class Carried:
     Parameters
     ----------
     p : int
-        Number of half-widths (q, r).
+        Number of groups, as in `Sites`.
     rows : float
         Rows over which what is known of half-widths fades to 1 / e.
 

@@ -190,8 +190,9 @@ def _mixture(
         "theta_effective": effective,
         "x0": mean([e.info["x0"] for e in ests]),
     }
-    if all(e.status.good for e in ests):
-        info["half_widths"] = {k: mean([e.info["half_widths"][k] for e in ests]) for k in ("mean", "sd", "lo", "hi")}
+    for name in ("half_widths", "variances"):
+        if name in info and all(e.status.good for e in ests):
+            info[name] = {k: mean([e.info[name][k] for e in ests]) for k in ("mean", "sd", "lo", "hi")}
     return replace(
         est,
         x=x,
@@ -200,6 +201,8 @@ def _mixture(
         method=typed(method),
         q=None if est.q is None else mean([e.q for e in ests]),
         r=None if est.r is None else mean([e.r for e in ests]),
+        Q=None if est.Q is None else mean([e.Q for e in ests]),
+        R=None if est.R is None else mean([e.R for e in ests]),
         theta=theta,
         loglik=float(top + math.log(total / _NODES) - np.linalg.slogdet(np.linalg.inv(L))[1]),
         names=model.names.x,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.model import Linear, Model, Nonlinear
-from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
+from halfwidth.noise import Gaussian, Mixed, Noise, Uniform, unknown_variances
 from halfwidth.record import Record
 from halfwidth.spread import Box
 from halfwidth.varying import Index, Varying
@@ -41,6 +41,8 @@ def refuses(model: Model, name: str) -> str | None:
     """Return why a filter for mixed noise cannot take a model, with a hint, or None."""
     if isinstance(model, Nonlinear):
         return f"`{name}` needs a linear model but this one is `Nonlinear`\nhint: use `ParticleFilter()`"
+    if (reason := unknown_variances(model.w, model.e, name)) is not None:
+        return reason
     if not model.w.known or not model.e.known:
         return f"`{name}` needs known half-widths but `w` or `e` has unknown ones\nhint: use `BatchLP()`, or Uniform(q)"
     if isinstance(model.x0, Box) and not np.isfinite([model.x0.lo, model.x0.hi]).all():

@@ -11,7 +11,7 @@ import numpy as np
 
 from halfwidth.array import Array
 from halfwidth.methods._residuals import first_scales
-from halfwidth.methods._sites import uniform_part
+from halfwidth.methods._sites import gaussian_part, uniform_part
 from halfwidth.model import Linear, Nonlinear, arity
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
@@ -107,11 +107,14 @@ def _first_path(model: Nonlinear, record: Record) -> Array:
     local = Linear(at.g_x, None, at.h_x, model.w, model.e, Normal(x0, 1.0))
     scale = first_scales(local, [record.y[record.seen[:, j], j] for j in range(model.ny)])
     for name, noise, size in (("w", model.w, scale[: model.nx]), ("e", model.e, scale[model.nx :])):
-        box = uniform_part(noise)
-        if box is not None and not noise.known:
-            noises[name] = Gaussian(np.clip(size, box.at_least, box.at_most) ** 2 / 3.0)
-        else:
+        if noise.known:
             noises[name] = Gaussian(noise.cov())
+            continue
+        box, part = uniform_part(noise), gaussian_part(noise)
+        var = np.zeros(len(size)) if box is None else np.clip(size, box.at_least, box.at_most) ** 2 / 3.0
+        if part is not None and part.at_least is not None and part.at_most is not None:
+            var = var + np.clip(size**2, part.at_least, part.at_most)
+        noises[name] = Gaussian(var)
     prior = model.x0
     if not isinstance(prior, Normal):
         wide = np.where(np.isfinite(prior.hi - prior.lo), prior.hi - prior.lo, 1e3 * scale[: model.nx])

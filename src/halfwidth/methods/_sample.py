@@ -28,7 +28,7 @@ from halfwidth.methods._residuals import Residuals, reference, residuals
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.sequential import SequentialLP, filled
 from halfwidth.model import Linear, Model, needs_a_box
-from halfwidth.noise import Gaussian, Noise, Uniform
+from halfwidth.noise import Gaussian, Noise, Uniform, unknown_variances
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box, Cloud, Normal
@@ -79,6 +79,8 @@ def refuses(model: Model) -> str | None:
                 f"the sampler takes uniform or Gaussian noise but `{name}` is `{type(noise).__name__}`"
                 "\nhint: ParticleFilter(smooth=True) draws from sums of both"
             )
+    if (reason := unknown_variances(model.w, model.e, "the sampler")) is not None:
+        return reason
     if model.loss is not None:
         return "the sampler takes lost outputs as NaN in the record but the model has a hidden loss\nhint: loss=None"
     for entry in model.theta_entries:

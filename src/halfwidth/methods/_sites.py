@@ -3,6 +3,9 @@
 ``x[t] = E^-1 (A x[t-1] + B u[t] + w[t])`` carries one factor on each w that has a uniform part; the rows of a stage are
 its seen outputs, ``h'x - y = e``, and the bounds. An unseen output that a seen one is correlated with through F is
 eliminated, and its half-width counts as variance of that row (as in `_residuals`).
+
+A Gaussian part of unknown variances has independent entries: its standard deviations are groups of their own, after the
+half-widths (q, r). Its rows are taken as they are, since nothing can be whitened that is not known.
 """
 
 import math
@@ -14,33 +17,40 @@ from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.methods._residuals import _eliminate, first_scales, reference, residuals
-from halfwidth.model import Linear
+from halfwidth.model import Linear, Model
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
 from halfwidth.record import Record
 from halfwidth.spread import Box, Normal
-from halfwidth.varying import Varying
+from halfwidth.varying import Varying, varying
 
 GAUSSIAN, UNIFORM, UNIFORM_GAUSSIAN, CONTAMINATED, MAYBE_LOST, TRUNCATION = range(6)
 #: Standard deviation of an outlier in half-widths.
 WIDE = 10.0
 #: Variances below this share of the output's own scale, squared, count as no noise: information must stay finite.
 _EXACT = 1e-12
+#: ... and so a standard deviation that is to be found stays above this share of it.
+_LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Sites:
     """The arrays of a problem, and which half-widths are to be found.
 
+    There are p = nx + ny groups, the half-widths (q, r), or twice as many: then the other half are the standard
+    deviations of Gaussian parts of w and e whose variances are unknown.
+
     Parameters
     ----------
     problem : dict
         For the core.
     free : (p,) bool array
-        Half-widths (q, r) that are unknown and have rows.
+        Groups that are unknown and have rows.
     floor, cap, scale, count : (p,) arrays
-        Bounds, order of size, and number of rows of each half-width.
+        Bounds, order of size, and number of rows of each.
     uniform : (p,) bool array
         Which entries have a half-width at all.
+    fitted : (p,) bool array
+        Which entries belong to a noise with unknown variances; `free` says which are.
     row, output : (K,) int arrays
         Row of the record and output of each row of the chain; -1 where it is a bound.
     """
@@ -52,8 +62,15 @@ class Sites:
     scale: Array
     count: Array
     uniform: NDArray[np.bool_]
+    fitted: NDArray[np.bool_]
     row: NDArray[np.intp]
     output: NDArray[np.intp]
+
+    @property
+    def guess(self) -> Array:
+        """Generous first values of all groups from the data's scale, (p,)."""
+        size = np.where(self.fitted, self.scale, math.sqrt(3.0) * self.scale)
+        return np.where(self.uniform | self.fitted, size.clip(self.floor, self.cap), 0.0)
 
     @property
     def outside(self) -> dict[str, Any] | None:
@@ -63,7 +80,7 @@ class Sites:
             return None
         rows = {k: np.ascontiguousarray(p[k][keep]) for k in ("h", "y", "kind", "group", "R", "lo", "hi")}
         before = np.concatenate([[0], np.cumsum(keep)])
-        return p | rows | {"lost": None, "mix": None, "start": before[p["start"]].astype(np.int32)}
+        return p | rows | {"lost": None, "mix": None, "group_R": None, "start": before[p["start"]].astype(np.int32)}
 
     @property
     def exact(self) -> bool:
@@ -96,6 +113,7 @@ class Frame:
     cap: Array
     count: Array
     uniform: NDArray[np.bool_]
+    fitted: NDArray[np.bool_]
     row: NDArray[np.intp]
     output: NDArray[np.intp]
     B: Array | None
@@ -104,16 +122,14 @@ class Frame:
 
     def fits(self, scale: Array, top: float) -> bool:
         """Say whether no variance is so small beside outputs of these scales (p,) and this size that it is lifted."""
-        return bool((self.R > 2.0 * _EXACT * np.maximum(scale[-len(self.R) :], math.sqrt(_EXACT) * top) ** 2).all())
+        return bool((2.0 * _EXACT * np.maximum(scale[-len(self.R) :], math.sqrt(_EXACT) * top) ** 2 < self.R).all())
 
 
 #: Frames that are kept of one model.
 _FRAMES = 64
 
 
-def sites(
-    model: Linear, record: Record, *, outliers: bool = False, frames: dict[bytes, Frame] | None = None
-) -> Sites:
+def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict[bytes, Frame] | None = None) -> Sites:
     """Build the chain of a model without unknown entries.
 
     `frames` keeps what windows of one model have in common, where its matrices are constant.
@@ -137,28 +153,35 @@ def sites(
         problem["b"] = np.zeros((len(record), model.nx)) if record.u is None else record.u @ frame.B.T
     # bounds have no output, and the target 0
     problem["y"] = np.einsum("kj,kj->k", frame.Y, y[np.maximum(frame.row, 0)])
-    return Sites(
-        problem, frame.free, frame.floor, frame.cap, scale, frame.count, frame.uniform, frame.row, frame.output
-    )
+    floor, cap, fitted = frame.floor, frame.cap, frame.fitted
+    if fitted.any():
+        scale = np.resize(scale, len(fitted))
+        floor = np.where(fitted & (floor < cap), np.minimum(np.maximum(floor, _LEAST * scale), cap), floor)
+    return Sites(problem, frame.free, floor, cap, scale, frame.count, frame.uniform, fitted, frame.row, frame.output)
 
 
 def _constant(model: Linear) -> bool:
     """Say whether a frame of the model serves other rows."""
     noises = [part for part in (gaussian_part(model.w), gaussian_part(model.e)) if part is not None]
-    return model.loss is None and all(
-        m.value is not None and m.value.ndim == 2 for m in (*model.matrices.values(), *(part.cov() for part in noises))
+    covs = [part.cov() for part in noises if part.known]
+    return (
+        model.loss is None
+        and all(m.value is not None and m.value.ndim == 2 for m in (*model.matrices.values(), *covs))
+        and all(part.known or bool(np.less(*_ends(part, 1)).all()) for part in noises)
     )
 
 
 def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame:
     T, nx, ny = len(record), model.nx, model.ny
     dt = record.steps(model.dt)
-    p = nx + ny
-    floor, cap, uniform = _half_widths(model)
+    floor, cap, uniform, fitted = _groups(model)
+    p = len(floor)
     problem: dict[str, Any] = {"groups": p, "wide": WIDE}
     _dynamics(problem, model, record, dt)
     w_group = np.where(uniform[:nx] & (cap[:nx] > 0), np.arange(nx), -1)
     problem["group_w"] = w_group.astype(np.int32)
+    of_w = (fitted & (floor < cap))[nx + ny :][:nx]
+    problem["group_Q"] = np.where(of_w, nx + ny + np.arange(nx), -1).astype(np.int32) if of_w.any() else None
     rows = _outputs(model, record, dt, scale, outliers)
     rows += _bounds(model, T)
     rows += _first_bounds(model)
@@ -176,22 +199,50 @@ def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame
         problem[name] = joined(name, dtype)
     problem["lost"] = joined("lost", float) if (problem["kind"] == MAYBE_LOST).any() else None
     problem["mix"] = joined("mix", float, (p,)) if any(r.mix.any() for r in rows) else None
+    group_R = joined("deviation", np.int32)
+    problem["group_R"] = group_R if (group_R >= 0).any() else None
     output = joined("output", np.intp)
-    count = np.r_[np.full(nx, float(T)), [float(np.count_nonzero(output == j)) for j in range(ny)]]
-    free = uniform & (floor < cap) & (count > 0)
+    count = np.resize(np.r_[np.full(nx, float(T)), [float(np.count_nonzero(output == j)) for j in range(ny)]], p)
+    free = (uniform | fitted) & (floor < cap) & (count > 0)
     B = None
     if all(m is None or m.constant for m in (model.B, model.E)):
         B = np.zeros((nx, model.nu)) if model.B is None else model.B.single
         B = B if problem["G"] is None else problem["G"][0] @ B
     part = gaussian_part(model.e)
     R = np.full(ny, np.inf)
-    if part is not None and uniform_part(model.e) is None and part.cov().constant:
+    if part is not None and uniform_part(model.e) is None and part.known and part.cov().constant:
         R = np.diagonal(part.cov().single)
-    return Frame(problem, free, floor, cap, count, uniform, stage[order] - 1, output, B, joined("Y", float, (ny,)), R)
+    Y = joined("Y", float, (ny,))
+    return Frame(problem, free, floor, cap, count, uniform, fitted, stage[order] - 1, output, B, Y, R)
+
+
+def groups(model: Model) -> int:
+    """Return the number of groups that the chain of a model has."""
+    once = model.nx + model.ny
+    return once if all(part is None or part.known for part in map(gaussian_part, (model.w, model.e))) else 2 * once
+
+
+def _groups(model: Linear) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return floors and caps of all groups, which are half-widths and which unknown deviations; each (p,)."""
+    floor, cap, uniform = _half_widths(model)
+    if groups(model) == len(floor):
+        return floor, cap, uniform, np.zeros(len(floor), dtype=bool)
+    of = [(gaussian_part(noise), n) for noise, n in ((model.w, model.nx), (model.e, model.ny))]
+    lo, hi = np.sqrt(np.concatenate([_ends(part, n) for part, n in of], axis=1))
+    asked = np.concatenate([np.full(n, part is not None and not part.known) for part, n in of])
+    no = np.zeros(len(floor), dtype=bool)
+    return np.r_[floor, lo], np.r_[cap, hi], np.r_[uniform, no], np.r_[no, asked]
+
+
+def _ends(part: Gaussian | None, n: int) -> Array:
+    """Return the variances between which unknown ones lie, (2, n); 0 for a noise that has none."""
+    if part is None or part.at_least is None or part.at_most is None:
+        return np.zeros((2, n))
+    return np.array([part.at_least, part.at_most])
 
 
 def _half_widths(model: Linear) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return floors and caps of the half-widths (q, r), 0 where a noise has none, and which have one; each (p,)."""
+    """Return floors and caps of the half-widths (q, r), 0 where a noise has none, and which have one, (nx + ny,)."""
     parts: list[tuple[Array, Array, NDArray[np.bool_]]] = []
     for noise, n in ((model.w, model.nx), (model.e, model.ny)):
         box = uniform_part(noise)
@@ -216,6 +267,15 @@ def gaussian_part(noise: Noise) -> Gaussian | None:
     return noise if isinstance(noise, Gaussian) else noise.gaussian if isinstance(noise, Mixed) else None
 
 
+def given(part: Gaussian, n: int) -> Varying | None:
+    """Return the covariance of a Gaussian part without entries whose variance is to be found, None if none is left."""
+    if part.known:
+        return part.cov()
+    lo, hi = _ends(part, n)
+    kept = np.where(lo < hi, 0.0, lo)
+    return varying(np.diag(kept), "Q", (n, n)) if kept.any() else None
+
+
 def _every(matrix: Varying, record: Record, dt: Array) -> Array:
     stack, index = matrix.stack(record.t, dt)
     return np.broadcast_to(stack, (len(record), *stack.shape[1:])) if index is None else stack[index]
@@ -231,7 +291,7 @@ def _dynamics(problem: dict[str, Any], model: Linear, record: Record, dt: Array)
     part = gaussian_part(model.w)
     problem["G"] = problem["G_index"] = problem["Q"] = problem["Q_index"] = None
     A, A_index = _one(model.A, record, dt)
-    Q = None if part is None else part.cov()
+    Q = None if part is None else given(part, model.nx)
     if Q is not None:
         problem["Q"], problem["Q_index"] = _one(Q, record, dt)
     if model.E is not None:
@@ -253,11 +313,12 @@ def _dynamics(problem: dict[str, Any], model: Linear, record: Record, dt: Array)
 
 def _added(model: Linear, record: Record) -> Array:
     """Return what inputs add to the state of each row, (T, nx), where a matrix varies."""
-    b, dt = np.zeros((len(record), model.nx)), record.steps(model.dt)
+    b: Array = np.zeros((len(record), model.nx))
+    dt = record.steps(model.dt)
     if model.B is not None and record.u is not None:
         b = np.einsum("tij,tj->ti", _every(model.B, record, dt), record.u)
     if model.E is not None:
-        b = np.linalg.solve(_every(model.E, record, dt), b[:, :, None])[:, :, 0]
+        b = np.asarray(np.linalg.solve(_every(model.E, record, dt), b[:, :, None])[:, :, 0])
     return np.ascontiguousarray(b)
 
 
@@ -296,50 +357,69 @@ class _Rows:
     lost: Array
     mix: Array
     output: NDArray[np.intp]
+    deviation: NDArray[np.int32]
 
     @classmethod
-    def of(cls, p: int, stage: NDArray[np.intp], h: Array, kind: Any, **more: Any) -> "_Rows":
-        """Fill in what a kind of row does not have; p half-widths, of states and outputs."""
-        K = len(stage)
-        none = {"Y": np.zeros((K, p - h.shape[1])), "group": np.full(K, -1), "R": np.zeros(K), "lo": np.zeros(K), "hi": np.zeros(K)}
-        none |= {"lost": np.zeros(K), "mix": np.zeros((K, p)), "output": np.full(K, -1)}
+    def of(cls, model: Linear, stage: NDArray[np.intp], h: Array, kind: Any, **more: Any) -> "_Rows":
+        """Fill in what a kind of row does not have."""
+        K, p = len(stage), groups(model)
+        none = {
+            "Y": np.zeros((K, model.ny)),
+            "group": np.full(K, -1),
+            "R": np.zeros(K),
+            "lo": np.zeros(K),
+            "hi": np.zeros(K),
+        }
+        none |= {"lost": np.zeros(K), "mix": np.zeros((K, p)), "output": np.full(K, -1), "deviation": np.full(K, -1)}
         return cls(stage=stage, h=h, kind=np.broadcast_to(np.asarray(kind, dtype=np.int8), (K,)), **(none | more))
 
 
 def _outputs(model: Linear, record: Record, dt: Array, scale: Array, outliers: bool) -> list[_Rows]:
     T, nx, ny = len(record), model.nx, model.ny
-    p = nx + ny
-    if uniform_part(model.e) is None:
+    p, once = groups(model), nx + ny
+    box, part = uniform_part(model.e), gaussian_part(model.e)
+    if box is None and part is not None and part.known:
         return _gaussian_outputs(model, record, dt, scale)
     C, seen = _every(model.C, record, dt), record.seen
     t, j = np.nonzero(seen)
     Y = np.eye(ny)[j]
     R = np.zeros((T, ny))
-    part = gaussian_part(model.e)
-    if part is not None:
-        R = np.diagonal(_every(part.cov(), record, dt), axis1=1, axis2=2)
+    own = None if part is None else given(part, ny)
+    if own is not None:
+        R = np.diagonal(_every(own, record, dt), axis1=1, axis2=2)
+    lo, hi = _ends(part, ny)
+    deviation = np.where(lo < hi, once + nx + np.arange(ny), -1)[j]
     mix = np.zeros((len(t), p))
     if model.F is not None:
         F = _every(model.F, record, dt)
         N = _eliminate(F, seen)
         C, Y = N @ C, (N @ F)[t, j]
         R = np.einsum("tij,tj->ti", N**2, R)
-        mix[:, nx:] = np.where(np.eye(ny)[j] > 0, 0.0, N[t, j] ** 2 / 3.0)
+        others = np.where(np.eye(ny)[j] > 0, 0.0, N[t, j] ** 2)
+        if box is not None:
+            mix[:, nx:once] = others / 3.0
+        if p > once:
+            mix[:, once + nx :] = np.where(lo < hi, others, 0.0)
     more: dict[str, Any] = {"lost": np.zeros(len(t))}
     if model.loss is not None:
         kind: Any = np.full(len(t), MAYBE_LOST)
         more["lost"] = _lost(model, record, dt, t, j)
     elif outliers:
         kind = np.full(len(t), CONTAMINATED)
+    elif box is None:
+        kind = np.full(len(t), GAUSSIAN)
+        floor = _EXACT * scale[nx + j] ** 2  # of a known variance beside unknown ones
+        R = R.copy()
+        R[t, j] = np.where(deviation < 0, np.maximum(R[t, j], floor), R[t, j])
     else:
-        kind = np.where((R[t, j] > 0) | mix.any(axis=1), UNIFORM_GAUSSIAN, UNIFORM)
-    return [_Rows.of(p, t + 1, C[t, j], kind, Y=Y, group=nx + j, R=np.array(R[t, j]), mix=mix, output=j, **more)]
+        kind = np.where((R[t, j] > 0) | (deviation >= 0) | mix.any(axis=1), UNIFORM_GAUSSIAN, UNIFORM)
+    more |= {"R": np.array(R[t, j]), "group": nx + j if box is not None else np.full(len(t), -1)}
+    return [_Rows.of(model, t + 1, C[t, j], kind, Y=Y, mix=mix, output=j, deviation=deviation, **more)]
 
 
 def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) -> list[_Rows]:
     """Whiten the seen outputs of each row."""
     nx, ny = model.nx, model.ny
-    p = nx + ny
     part = gaussian_part(model.e)
     assert part is not None
     C, R = _every(model.C, record, dt), _every(part.cov(), record, dt)
@@ -364,7 +444,7 @@ def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) ->
             for a, j in enumerate(s):
                 more = {"Y": np.tile(np.eye(ny)[j], (t.size, 1)), "R": part_R[:, a, a], "output": np.full(t.size, j)}
                 more["lost"] = _lost(model, record, dt, t, np.full(t.size, j))
-                found.append(_Rows.of(p, t + 1, C[t, j], MAYBE_LOST, **more))
+                found.append(_Rows.of(model, t + 1, C[t, j], MAYBE_LOST, **more))
             continue
         try:
             L = np.linalg.cholesky(part_R)
@@ -379,7 +459,7 @@ def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) ->
         for a, j in enumerate(s):
             found.append(
                 _Rows.of(
-                    p, t + 1, h[:, a] * d[:, a, None], GAUSSIAN, Y=white[:, a] * d[:, a, None], R=d[:, a] ** 2,
+                    model, t + 1, h[:, a] * d[:, a, None], GAUSSIAN, Y=white[:, a] * d[:, a, None], R=d[:, a] ** 2,
                     output=np.full(t.size, j),
                 )
             )  # fmt: skip
@@ -388,7 +468,8 @@ def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) ->
 
 def _lost(model: Linear, record: Record, dt: Array, t: NDArray[np.intp], j: NDArray[np.intp]) -> Array:
     """Return the log density of each seen output if it was lost."""
-    R = _every(model.e.cov(), record, dt)
+    # unknown noise says nothing here: the noise of lost samples is given then
+    R = _every(model.e.cov(), record, dt) if model.e.known else np.zeros((len(record), model.ny, model.ny))
     kind = model.loss.kind[0]
     found = np.zeros(len(t))
     center = np.broadcast_to(np.asarray(model.loss.center, dtype=float), (model.ny,))
@@ -402,23 +483,22 @@ def _bounds(model: Linear, T: int) -> list[_Rows]:
     if model.bounds is None:
         return []
     D, lo, hi = model.bounds.rows
-    p = model.nx + model.ny
     keep = np.isfinite(lo) | np.isfinite(hi)
     D, lo, hi = D[keep], lo[keep], hi[keep]
     if not keep.any():
         return []
     K = len(D)
     stage, h = np.repeat(np.arange(1, T + 1), K), np.broadcast_to(D, (T, K, model.nx)).reshape(-1, model.nx)
-    return [_Rows.of(p, stage, h, TRUNCATION, lo=np.tile(lo, T), hi=np.tile(hi, T))]
+    return [_Rows.of(model, stage, h, TRUNCATION, lo=np.tile(lo, T), hi=np.tile(hi, T))]
 
 
 def _first_bounds(model: Linear) -> list[_Rows]:
     """One end of the box of x0 without the other is a bound of stage 0."""
     if not isinstance(model.x0, Box):
         return []
-    p, nx = model.nx + model.ny, model.nx
+    nx = model.nx
     one = np.flatnonzero(np.isfinite(model.x0.lo) ^ np.isfinite(model.x0.hi))
     if not one.size:
         return []
     stage = np.zeros(one.size, dtype=np.intp)
-    return [_Rows.of(p, stage, np.eye(nx)[one], TRUNCATION, lo=model.x0.lo[one], hi=model.x0.hi[one])]
+    return [_Rows.of(model, stage, np.eye(nx)[one], TRUNCATION, lo=model.x0.lo[one], hi=model.x0.hi[one])]

@@ -26,6 +26,7 @@ from halfwidth.array import Array
 from halfwidth.methods._carry import Carried
 from halfwidth.methods._protocol import Estimator, pushed_row, typed
 from halfwidth.methods._residuals import reference, residuals
+from halfwidth.methods._sites import groups
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.posterior import Posterior
 from halfwidth.methods.sequential import (
@@ -53,7 +54,10 @@ TOL = 1e-8
 
 
 class Solved(NamedTuple):
-    """One window: states (rows + 1, nx), theta, half-widths (nx + ny,), how it went, and the spread of its rows."""
+    """One window: states (rows + 1, nx), theta, half-widths (nx + ny,), how it went, the spread of its rows, variances.
+
+    Variances (nx + ny,) are None where none is unknown; NaN stands for an entry that has none, as in half-widths.
+    """
 
     x: Array
     theta: Array
@@ -62,6 +66,7 @@ class Solved(NamedTuple):
     iterations: int
     info: dict[str, Any]
     spread: Spread | None = None
+    variances: Array | None = None
 
 
 class Forecasts:
@@ -242,13 +247,13 @@ class Sliding:
             est = self._posterior(model, part, a)
         else:
             est = method.run(model, part, seed=self.seed)
-        s = np.full(model.nx + model.ny, np.nan) if est.q is None or est.r is None else np.r_[est.q, est.r]
-        info = {
-            k: v for k, v in est.info.items() if k in ("solver", "objective", "notes", "message", "gap", "half_widths")
-        }
+        told = ("solver", "objective", "notes", "message", "gap", "half_widths", "variances")
+        info = {k: v for k, v in est.info.items() if k in told}
+        s = _both(est.q, est.r, model)
+        variances = None if est.Q is None and est.R is None else _both(est.Q, est.R, model)
         return Solved(
             np.vstack([est.info.get("x0", self.x[a]), est.x]), np.zeros(0) if est.theta is None else est.theta, s,
-            est.status, int(est.info.get("iterations", 0) or 0), info, est.spread,
+            est.status, int(est.info.get("iterations", 0) or 0), info, est.spread, variances,
         )  # fmt: skip
 
     def _posterior(self, model: Model, part: Record, a: int) -> Estimate:
@@ -343,7 +348,12 @@ class Sliding:
             "theta": self.theta.tolist(), "costs": None if self.costs is None else self.costs.tolist(),
             "start": None if self.start is None else [part.tolist() for part in self.start],
             "carried": None if self.carried is None else self.carried.save(),
-            "last": None if last is None else [last.theta.tolist(), plain([last.s])[0], last.status.name],
+            "last": None
+            if last is None
+            else [
+                last.theta.tolist(), plain([last.s])[0], last.status.name,
+                None if last.variances is None else plain([last.variances])[0],
+            ],
         }  # fmt: skip
 
     def load(self, saved: dict[str, Any]) -> None:
@@ -376,8 +386,22 @@ class Sliding:
             self.carried.load(saved["carried"])
         self.last = None
         if saved["last"] is not None:
-            theta, s, status = saved["last"]
-            self.last = Solved(np.array(self.x), np.array(theta, dtype=float), arrays([s])[0], Status[status], 0, {})
+            theta, s, status, v = saved["last"]
+            variances = None if v is None else arrays([v])[0]
+            self.last = Solved(
+                np.array(self.x), np.array(theta, dtype=float), arrays([s])[0], Status[status], 0, {}, None, variances
+            )
+
+
+def _both(of_w: Array | None, of_e: Array | None, model: Model) -> Array:
+    """Return what belongs to states and outputs side by side, NaN where there is none."""
+    parts = [np.full(n, np.nan) if part is None else part for part, n in ((of_w, model.nx), (of_e, model.ny))]
+    return np.concatenate(parts)
+
+
+def if_found(values: Array, status: Status) -> Array | None:
+    """Return a copy of half-widths or variances that a window found, None where it found none."""
+    return values.copy() if status.good and bool(np.isfinite(values).all()) else None
 
 
 def stacked(spreads: list[Spread | None]) -> Spread | None:
@@ -426,7 +450,7 @@ class Live:
         model = held.model
         solved = held.push(*pushed_row(model, y, u, dt))
         low, high, windows = held.ahead.bounds()
-        good, nx = solved.status.good and np.isfinite(solved.s).all(), model.nx
+        nx, v = model.nx, solved.variances
         back = held.back()
         ago = slice(-1 - back, -back or None)
         return Estimate(
@@ -435,8 +459,10 @@ class Live:
             None if solved.spread is None else rows_of_spread(solved.spread, ago),
             solved.status,
             self.method,
-            q=solved.s[:nx].copy() if good else None,
-            r=solved.s[nx:].copy() if good else None,
+            q=if_found(solved.s[:nx], solved.status),
+            r=if_found(solved.s[nx:], solved.status),
+            Q=None if v is None else if_found(v[:nx], solved.status),
+            R=None if v is None else if_found(v[nx:], solved.status),
             theta=solved.theta.copy() if solved.theta.size else None,
             names=model.names.x,
             info=solved.info
@@ -559,7 +585,7 @@ def carried_of(window: "Window", model: Model) -> Carried | None:
         return None
     if isinstance(model, Linear) and model.theta_entries:
         return None
-    return Carried(model.nx + model.ny, window.recall * (window.memory + 1))
+    return Carried(groups(model), window.recall * (window.memory + 1))
 
 
 def shares_costs(method: Estimator, model: Model) -> bool:

@@ -149,7 +149,9 @@ def foretold(model: Linear, est: Estimate, record: Record) -> tuple[Array, Array
     box, part = uniform_part(model.e), gaussian_part(model.e)
     if box is not None:
         R = R + np.diag((box.q if box.known else np.asarray(est.r)) ** 2 / 3.0)
-    if part is not None:
+    if part is not None and not part.known:
+        R = R + np.diag(np.asarray(est.R))
+    elif part is not None:
         own, which = part.cov().stack(record.t, dt)
         R = R + (own if which is None else own[which])
     mean = np.einsum("tij,tj->ti", C, est.x)

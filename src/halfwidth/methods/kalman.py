@@ -17,7 +17,7 @@ from halfwidth.array import Array
 from halfwidth.errors import BadRecord, BadValue
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear
-from halfwidth.noise import Gaussian, Uniform
+from halfwidth.noise import Gaussian, Uniform, unknown_variances
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Newest, Status
 from halfwidth.spread import Box, Normal
@@ -175,6 +175,8 @@ def not_gaussian(model: Model, name: str) -> str | None:
         symbols = "`, `".join(wrong)
         verb = "are" if len(wrong) > 1 else "is"
         return f"`{name}` needs Gaussian noise but `{symbols}` {verb} `{kinds}`\nhint: {hint}"
+    if (reason := unknown_variances(model.w, model.e, name)) is not None:
+        return reason
     if isinstance(model.x0, Box):
         return f"`{name}` needs a Gaussian prior but `x0` is `Box`\nhint: x0=Normal(mean, P), or `model.as_gaussian()`"
     if model.bounds is not None:

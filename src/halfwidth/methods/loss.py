@@ -34,7 +34,7 @@ from halfwidth.errors import BadRecord, BadValue, HalfwidthError, Refused
 from halfwidth.loss import Bernoulli, Loss, Markov, Modes, revised
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear, arity
-from halfwidth.noise import Gaussian
+from halfwidth.noise import Gaussian, unknown_variances
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Newest, Status
 from halfwidth.spread import Normal
@@ -105,6 +105,8 @@ class _LossMethod:
                     f"`{name}` needs Gaussian noise but `{symbol}` is {type(noise).__name__}\n"
                     "hint: use `model.as_gaussian()`"
                 )
+        if (reason := unknown_variances(model.w, model.e, name)) is not None:
+            return reason
         if not isinstance(model.x0, Normal):
             return (
                 f"`{name}` needs a Gaussian prior but `x0` is a box\nhint: x0=Normal(mean, P), or `model.as_gaussian()`"

@@ -27,7 +27,7 @@ from halfwidth.errors import BadShape, BadValue, HalfwidthError, Refused, hinted
 from halfwidth.methods._deviations import Function, Spread, scan
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear, arity
-from halfwidth.noise import Gaussian
+from halfwidth.noise import Gaussian, unknown_variances
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Normal
@@ -202,6 +202,8 @@ def _refuses(method: Method, model: Model) -> str | None:
     if not isinstance(model.w, Gaussian) or not isinstance(model.e, Gaussian):
         given = f"`w` is {type(model.w).__name__}, `e` is {type(model.e).__name__}"
         return f"`{name}` needs Gaussian noise but {given}\nhint: model.as_gaussian(), or ParticleFilter()"
+    if (reason := unknown_variances(model.w, model.e, name)) is not None:
+        return reason
     if not isinstance(model.x0, Normal):
         return f"`{name}` needs a Gaussian prior but `x0` is a {type(model.x0).__name__}\nhint: x0=Normal(mean, P)"
     if model.bounds is not None:

@@ -25,7 +25,7 @@ from halfwidth.array import Array, generator
 from halfwidth.errors import BadValue
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model, Nonlinear, arity
-from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
+from halfwidth.noise import Gaussian, Mixed, Noise, Uniform, unknown_variances
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box, Cloud, Halfspaces
@@ -77,6 +77,8 @@ class ParticleFilter:
 
     def refuses(self, model: Model) -> str | None:
         """Return why the model cannot be taken, or None."""
+        if (reason := unknown_variances(model.w, model.e, "ParticleFilter")) is not None:
+            return reason
         if not model.w.known or not model.e.known:
             return "`ParticleFilter` needs known half-widths but `w` or `e` has unknown ones\nhint: Uniform(q)"
         if isinstance(model.x0, Box) and not np.isfinite([model.x0.lo, model.x0.hi]).all():

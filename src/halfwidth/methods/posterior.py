@@ -105,13 +105,13 @@ class Posterior:
     half-widths and entries, and ``ess``, their smallest effective number of draws; the status is REDUCED above an R-hat
     of 1.01 and STALLED above 1.05. Of "ep":
 
-    ``q``, ``r`` are posterior means. ``loglik`` is the logarithm of the evidence, half-widths integrated out under a
-    prior one unit of log s wide around their mode, so that models with more unknowns do not win by that alone; bounds
-    count as a factor in 26 rows and as a condition in the others. In ``info``: ``x0``; ``half_widths``, a mapping
-    with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %) of (q, r); ``outliers``, the named outputs with a
-    probability above one half; ``residual``,
-    the disagreement of moments in standard deviations, the largest of each node; ``sweeps``; ``nodes`` and their
-    ``effective`` number.
+    ``q``, ``r`` are posterior means, ``Q``, ``R`` those of unknown variances. ``loglik`` is the logarithm of the
+    evidence, half-widths and standard deviations integrated out under a prior one unit of log s wide around their mode,
+    so that models with more unknowns do not win by that alone; bounds count as a factor in 26 rows and as a condition
+    in the others. In ``info``: ``x0``; ``half_widths``, a mapping with ``mean``, ``sd``, ``lo`` and ``hi`` (5 and 95 %)
+    of (q, r); ``variances``, the same of (Q, R) where some are unknown; ``outliers``, the named outputs with a
+    probability above one half; ``residual``, the disagreement of moments in standard deviations, the largest of each
+    node; ``sweeps``; ``nodes`` and their ``effective`` number.
 
     Raises
     ------
@@ -220,9 +220,7 @@ class Posterior:
             return with_entries(self, model, record)
         return self.answer(model, record).estimate
 
-    def resumed(
-        self, model: Model, record: Record, held: Carried, first: int, drop: int, shaped: int = 0
-    ) -> "Answer":
+    def resumed(self, model: Model, record: Record, held: Carried, first: int, drop: int, shaped: int = 0) -> "Answer":
         """Return the answer of one window of a stream.
 
         `held` is what earlier windows handed on, `first` the number of the window's first row, which lies `drop` rows
@@ -233,9 +231,7 @@ class Posterior:
             from halfwidth.methods._relinearise import relinearised
 
             return relinearised(self, model, record, s=None if held.start is None else held.start.s, known=known)
-        return self.answer(
-            model, record, start=held.start, drop=drop, known=known, frames=held.frames, shaped=shaped
-        )
+        return self.answer(model, record, start=held.start, drop=drop, known=known, frames=held.frames, shaped=shaped)
 
     def answer(
         self,
@@ -266,16 +262,15 @@ class Posterior:
             except BadShape:  # a noise stacked row by row
                 quick = None
             if quick is not None and int(quick.found["code"]) < 2:
-                start = Start(np.where(quick.chain.free, quick.start.s, math.sqrt(3.0) * problem.scale))
+                start = Start(np.where(quick.chain.free, quick.start.s, problem.guess))
         found = self._solve(problem, model, start, drop, known, shaped)
-        return Answer(self._estimate(problem, found, model, record), problem, found)
+        return Answer(self._estimate(problem, found, model, record), problem, found, self._rate(model)[0])
 
     def _solve(
         self, chain: Sites, model: Linear, start: Start | None, drop: int, known: Known | None, shaped: int
     ) -> dict[str, Any]:
         rate, learn_rate, beta = self._rate(model)
-        first = np.where(chain.uniform, (math.sqrt(3.0) * chain.scale).clip(chain.floor, chain.cap), 0.0)
-        first = np.where(chain.free, first, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
+        first = np.where(chain.free, chain.guess, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
         if start is not None:
             first = np.where(chain.free, start.s.clip(chain.floor, chain.cap), first)
         q = int(chain.free.sum()) + learn_rate
@@ -296,9 +291,10 @@ class Posterior:
         return dict(
             _core.ep_learn(
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
-                learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z,
-                limits, None if start is None else start.before, drop, shaped, None if known is None else known.pull,
-                None if known is None else known.precision, chain.outside if limits["condition"] > 0 else None,
+                chain.fitted, learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z,
+                limits, None if start is None else start.before, drop, shaped,
+                None if known is None else known.pull, None if known is None else known.precision,
+                chain.outside if limits["condition"] > 0 else None,
             )
         )  # fmt: skip
 
@@ -322,11 +318,11 @@ class Posterior:
         x, P, k3, k4 = found["x"], found["P"], found["k3"], found["k4"]
         sound = code < 2 and bool(np.isfinite(x).all() and np.isfinite(P).all())
         info: dict[str, Any] = {"notes": []}
-        s = np.where(chain.free, np.clip(math.sqrt(3.0) * chain.scale, chain.floor, chain.cap), chain.floor)
-        widths = {"mean": s, "sd": np.zeros_like(s), "lo": s, "hi": s}
+        s = np.where(chain.free, chain.guess, chain.floor)
+        value = np.where(chain.fitted, s**2, s)
+        widths = {"mean": value, "sd": np.zeros_like(s), "lo": value, "hi": value}
         if sound:
             widths = {name: found[name] for name in widths}
-        if sound:
             one = found["nodes"] == 1 and found["mode"].size > 0
             few = code == 1 if one else found["nodes"] > 1 and found["effective"] < _FEW
             status = Status.STALLED if residual > _USABLE else Status.REDUCED if residual > _FINE or few else Status.OK
@@ -348,7 +344,7 @@ class Posterior:
         within = None if box is None else (np.asarray(box.lo), np.asarray(box.hi))
         if box is not None:
             x = np.concatenate([x[:1], np.clip(x[1:], box.lo, box.hi)])
-        if chain.exact or not sound:
+        if (chain.exact and not chain.free.any()) or not sound:
             spread: Any = Normal.of(x[1:].copy(), P[1:].copy(), within)
         else:
             spread = Shaped(x[1:].copy(), P[1:].copy(), k3[1:].copy(), k4[1:].copy(), within)
@@ -364,16 +360,20 @@ class Posterior:
             else:
                 info["outliers"] = _named(share, model, record)
                 info["outlier_probability"] = share
-        has_q, has_r = chain.uniform[:nx].any(), chain.uniform[nx:].any()
-        lost = chain.uniform & (chain.floor < chain.cap) & (chain.count == 0)
+        p = nx + model.ny
+        has_q, has_r = chain.uniform[:nx].any(), chain.uniform[nx:p].any()
+        has_Q, has_R = chain.fitted[p : p + nx].any(), chain.fitted[p + nx :].any()
+        lost = (chain.uniform | chain.fitted) & (chain.floor < chain.cap) & (chain.count == 0)
         if lost.any():
-            names = [*model.names.x, *model.names.y]
-            info["notes"].append(
-                "bound not identifiable: " + ", ".join(n for n, m in zip(names, lost, strict=True) if m)
-            )
+            names = np.array([*model.names.x, *model.names.y])
+            for what, part in (("bound", lost[:p]), ("variance", lost[p:])):
+                if part.any():
+                    info["notes"].append(f"{what} not identifiable: " + ", ".join(names[part]))
+        if len(lost) > p:
+            info["variances"] = {name: v[p:] for name, v in widths.items()}
         info |= {
             "x0": x[0].copy(),
-            "half_widths": widths,
+            "half_widths": {name: v[:p] for name, v in widths.items()},
             "rate": found["rate"] if sound else None,
             "residual": residual,
             "sweeps": int(found["sweeps"]),
@@ -387,7 +387,9 @@ class Posterior:
             status,
             typed(self),
             q=widths["mean"][:nx].copy() if has_q and sound else None,
-            r=widths["mean"][nx:].copy() if has_r and sound else None,
+            r=widths["mean"][nx:p].copy() if has_r and sound else None,
+            Q=widths["mean"][p : p + nx].copy() if has_Q and sound else None,
+            R=widths["mean"][p + nx :].copy() if has_R and sound else None,
             gamma=gamma,
             loglik=loglik,
             names=model.names.x,
@@ -409,11 +411,12 @@ class Posterior:
 
 
 class Answer(NamedTuple):
-    """An estimate, its chain and what the core found."""
+    """An estimate, its chain, what the core found, and the rate of outliers or losses if it is told."""
 
     estimate: Estimate
     chain: Sites
     found: dict[str, Any]
+    rate: float
 
     @property
     def start(self) -> Start:
@@ -481,6 +484,8 @@ def _stages(count: int) -> list[int]:
 
 
 def _diagonal(part: Gaussian) -> bool:
+    if not part.known:
+        return True
     R = part.cov()
     if not R.constant:
         return False

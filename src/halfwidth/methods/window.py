@@ -44,6 +44,7 @@ from halfwidth.methods._sliding import (
     Live,
     Sliding,
     first_costs,
+    if_found,
     rows_since_fix,
     stacked,
     window_lasts,
@@ -86,11 +87,10 @@ class Window:
     -----
     ``x[k]`` is the state of row k in the window that ends at row k + `lag`, or at the last one. In ``info``:
     ``smoothed`` (T, nx), the last estimate of each state; ``low``, ``high`` and ``windows``, what `ensemble_interval`
-    needs; ``q``, ``r``, ``theta`` of every window; ``start``, ``extrapolated``, ``since_fix``, ``statuses``,
-    ``iterations`` and, of ``BatchLP``,
-    ``seconds`` of CPU time of every row; ``newest_low``, ``newest_high``, ``newest_windows``, what
-    ``ensemble_interval(newest=True)`` needs. Those of the estimate itself are the last window's; its status is
-    the worst of all windows.
+    needs; ``q``, ``r``, ``theta`` of every window, and ``Q``, ``R`` where variances are unknown; ``start``,
+    ``extrapolated``, ``since_fix``, ``statuses``, ``iterations`` and, of ``BatchLP``, ``seconds`` of CPU time of every
+    row; ``newest_low``, ``newest_high``, ``newest_windows``, what ``ensemble_interval(newest=True)`` needs. Those of
+    the estimate itself are the last window's; its status is the worst of all windows.
 
     Raises
     ------
@@ -207,6 +207,10 @@ class Window:
             found.filtered[done] = np.array(rows.x)[of_window]
             found.s[t], found.statuses[t] = solved.s, solved.status
             found.iterations[t] = solved.iterations
+            if solved.variances is not None:
+                if found.variances is None:
+                    found.variances = np.full((T, nx + model.ny), np.nan)
+                found.variances[t] = solved.variances
             if found.theta is not None and found.theta.shape[1] == solved.theta.size:
                 found.theta[t] = solved.theta
             found.newest_low[t], found.newest_high[t], found.newest_windows[t] = rows.ahead.bounds()
@@ -253,16 +257,19 @@ class Window:
             info["message"] = f"{worst.value}; {int(np.count_nonzero(since > 0))} rows extrapolate beyond the last fix"
         spread = stacked(found.spreads) if found.spreads else None
         theta = found.theta[-1] if found.theta is not None and found.theta.shape[1] else None
-        s = found.s[-1]
-        known = np.isfinite(s).all() and found.statuses[-1].good
+        s, end, v = found.s[-1], found.statuses[-1], found.variances
+        if v is not None:
+            info |= {"Q": v[:, :nx], "R": v[:, nx:]}
         return Estimate(
             record.t,
             found.filtered,
             spread,
             worst,
             typed(self),
-            q=s[:nx].copy() if known else None,
-            r=s[nx:].copy() if known else None,
+            q=if_found(s[:nx], end),
+            r=if_found(s[nx:], end),
+            Q=None if v is None else if_found(v[-1, :nx], end),
+            R=None if v is None else if_found(v[-1, nx:], end),
             theta=None if theta is None else theta.copy(),
             names=model.names.x,
             labels=record.labels,
@@ -287,6 +294,7 @@ class _Found:
     newest_high: Array = dataclasses.field(init=False)
     newest_windows: NDArray[np.int_] = dataclasses.field(init=False)
     spreads: list[Spread | None] = dataclasses.field(default_factory=list)
+    variances: Array | None = None
 
     def __post_init__(self) -> None:
         self.newest_low, self.newest_high = np.empty_like(self.filtered), np.empty_like(self.filtered)

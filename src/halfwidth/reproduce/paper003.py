@@ -140,7 +140,7 @@ def score(drawn: Drawn, est: Estimate, memory: int, model: Linear, seconds: floa
         np.array(entry),
         np.abs(est.x - drawn.x)[memory:].mean(axis=0),
         np.abs(drawn.record.y - y)[memory:].mean(axis=0),
-        np.nanmean(np.abs(prediction_errors(model, drawn.record, est))[memory:], axis=0),
+        np.nanmean(np.abs(prediction_errors(model, drawn.record, est.x, est.info.get("theta")))[memory:], axis=0),
         seconds,
         len(est.info["unsolved"]),
     )

@@ -260,11 +260,11 @@ def _rows(drives: Sequence[Grid]) -> _Rows:
         far[i] = 100.0 + 2.0 * float(np.sum((np.abs(drive.speed) * drive.h)[1 : k + 1]))
     y = np.column_stack((joined("east"), joined("north"))) - origin[index]
     y[~seen] = 0.0
-    gap = np.concatenate([_in_gap(drive) for drive in drives])
+    gap = np.concatenate([in_gap(drive) for drive in drives])
     return _Rows(offsets, index, first, h, v, w, weight2, extra, gap, y, np.column_stack((seen, seen)), origin, far)
 
 
-def _in_gap(drive: Grid) -> Mask:
+def in_gap(drive: Grid) -> Mask:
     """Return the steps between fixes much further apart than usual, and before the first and after the last."""
     seen = np.flatnonzero(drive.seen)
     after = np.searchsorted(seen, np.arange(len(drive)))

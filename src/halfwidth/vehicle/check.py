@@ -1,8 +1,9 @@
 """What is wrong with a log, each point with a verdict, the number it rests on and what to type.
 
 Nothing is repaired here. Units, signs and conventions are judged against the fixes (`evidence`),
-times against themselves, values against what a car does. What the log cannot tell is said to be not
-checked, never guessed.
+times against themselves, values against what a car does. What `fill` would do of its own is done here in
+the same order before the sensors are judged: leaps, frozen fixes and late stamps spoil a calibration. What the
+log cannot tell is said to be not checked, never guessed.
 """
 
 from collections.abc import Mapping
@@ -24,6 +25,7 @@ from halfwidth.vehicle.repair import (
     swapped_columns,
 )
 from halfwidth.vehicle.spikes import spikes
+from halfwidth.vehicle.stamps import Stamps, delays, restamped
 
 Floats = NDArray[np.float64]
 
@@ -161,15 +163,18 @@ def check(log: Any) -> Check:
     swapped = _swapped(log)
     if swapped.verdict == "bad":
         first = "put latitude and longitude right first"
-        names = ("outliers", "speed", "azimuth", "yaw rate", "trust", *check_sensors.NAMES)
+        names = ("outliers", "speed", "azimuth", "yaw rate", "trust", "stamps", *check_sensors.NAMES)
         moving = [Item(name, "not checked", first) for name in names]
     else:
-        moving = [_outliers(log), _speed(log), _azimuth(log), _yaw(log), _trust(log)]
+        moving = [_outliers(log), _speed(log), _azimuth(log), _yaw(log)]
+        trust, believed = _trust(log)
         row = matched_factor(evidence.speed_ratio(log))
         if row is not None and row[3] != 1:
-            moving += [Item(name, "not checked", "put the time right first") for name in check_sensors.NAMES]
+            first = "put the time right first"
+            moving += [trust, *(Item(name, "not checked", first) for name in ("stamps", *check_sensors.NAMES))]
         else:
-            moving += check_sensors.items(log, calibrated(log))
+            said, stamps = restamped(believed)
+            moving += [trust, _stamps(believed, stamps), *check_sensors.items(said, calibrated(said), stamps)]
     items = (
         _streams(log),
         _rates(log),
@@ -307,17 +312,34 @@ def _outliers(log: Log) -> Item:
     )
 
 
-def _trust(log: Log) -> Item:
-    """Look for fixes that were frozen or jumped, with what a car can have done in between."""
+def _trust(log: Log) -> tuple[Item, Log]:
+    """Look for fixes that were frozen or jumped; return the log without them.
+
+    Where speed and yaw rate speak, it is they that show jumps: see `check_sensors`.
+    """
     n = int(log.fixed.sum())
     if n < 10:
-        return Item("trust", "not checked", "too few fixes")
-    found = distrusted(log)
+        return Item("trust", "not checked", "too few fixes"), log
+    sensed = _there(log, "speed_mps") and _there(log, "yaw_rate_radps")
+    found = distrusted(log, jumps=not sensed)
     if not len(found):
-        return Item("trust", "ok", "no fix is frozen or jumps", 0.0)
+        return Item("trust", "ok", "no fix is frozen" + (" or jumps" * (not sensed)), 0.0), log
     said = "; ".join(words.removesuffix(": not used") for words in found.words(log))
     line = check_sensors.fill_line(log)
-    return Item("trust", "bad" if len(found) > 0.05 * n else "warn", said, float(len(found)), line=line)
+    item = Item("trust", "bad" if len(found) > 0.05 * n else "warn", said, float(len(found)), line=line)
+    return item, found.masked(log)
+
+
+def _stamps(log: Log, stamps: Stamps) -> Item:
+    """Say whether a logger wrote late."""
+    if stamps.moved:
+        late = float((stamps.written - stamps.said).max())
+        return Item("stamps", "warn", stamps.words(), late, "s", check_sensors.fill_line(log))
+    if not _there(log, "speed_mps"):
+        return Item("stamps", "not checked", "there is no speed to tell when the fixes were taken")
+    if not delays(log.t[log.fixed])[1]:
+        return Item("stamps", "not checked", "fixes are too few, or come at no regular rate")
+    return Item("stamps", "ok", "no row was written so late that fixes and speed tell", 0.0, "s")
 
 
 def _speed(log: Log) -> Item:

@@ -5,7 +5,7 @@ Each point rests on a `Calibration`; `fill` applies all of it by itself, so what
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from halfwidth.vehicle.align import EDGE
 from halfwidth.vehicle.grid import sampled
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.sensors import STREAM, Calibration, Offset
+from halfwidth.vehicle.stamps import Stamps
 from halfwidth.vehicle.stray import strays
 
 #: The points, in order.
@@ -92,7 +93,7 @@ def fill_line(log: Log) -> str:
     return f"halfwidth fill {shlex.quote(source)} -o track.gpx"
 
 
-def items(log: Log, known: Calibration) -> list[Item]:
+def items(log: Log, known: Calibration, stamps: Stamps | None = None) -> list[Item]:
     """Give a verdict on each point.
 
     Parameters
@@ -100,6 +101,8 @@ def items(log: Log, known: Calibration) -> list[Item]:
     log : Log
     known : Calibration
         Of this log.
+    stamps : Stamps, optional
+        How its rows were moved, so that times are named as written.
 
     Returns
     -------
@@ -114,7 +117,7 @@ def items(log: Log, known: Calibration) -> list[Item]:
         _standstill(log, known),
         _slip(known),
         _fix_error(known),
-        _strays(log, known),
+        _strays(log, known, stamps),
     ]
 
 
@@ -218,11 +221,13 @@ def _fix_error(known: Calibration) -> Item:
     return Item("fix error", "ok", text, quick, "m", evidence=dict(known.noise))
 
 
-def _strays(log: Log, known: Calibration) -> Item:
+def _strays(log: Log, known: Calibration, stamps: Stamps | None) -> Item:
     if not known.noise or not {"speed", "yaw_rate"} <= set(known.offsets):
         return Item("stray fixes", "not checked", "it needs speed, yaw rate and fixes that agree with them")
     grid = sampled(log, sensors=known)
     found = strays(grid, known)
+    if stamps is not None:
+        grid = replace(grid, t=stamps.back(grid.t))
     if not found.at.size:
         return Item("stray fixes", "ok", "no fix lies where the vehicle cannot have been", 0.0)
     shown = {"times": grid.t[found.at].tolist(), "off_m": found.size.tolist()}

@@ -5,7 +5,8 @@ fix before or as garbage, in bursts (`halfwidth.loss`). Smoothing the probabilit
 holds positions in steps: a repeat has probability one from a frozen receiver and (density times step) from a live one,
 so the stale mode gets the standard deviation step / sqrt(2 pi). Live receivers repeat themselves too when the car
 stands, so a repeat is held against one only if the car moved meanwhile, by its own speed if the log has it, else by
-where the receiver is afterwards.
+where the receiver is afterwards. Fixes that are off by the same for seconds and then step to where the others are show
+by that step (`steps`), and are gone before the rest is judged.
 """
 
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from halfwidth.record import Record
 from halfwidth.spread import Normal
 from halfwidth.vehicle import evidence
 from halfwidth.vehicle.log import Log
+from halfwidth.vehicle.steps import stepped
 
 Floats = NDArray[np.float64]
 
@@ -126,12 +128,13 @@ def distrusted(log: Log, *, jumps: bool = True) -> Distrust:
     if not jumps and not _repeats(y).any():
         return NOTHING
     step = _step(y)
+    wrong = stepped(t, y) & ~_repeats(y) if jumps else np.zeros(t.size, dtype=bool)
     try:
-        p, stale, far = _probabilities(t, y, step)
+        p, stale, far = _probabilities(t, y, step, ~wrong)
     except HalfwidthError:  # a log too strange for the model: nothing is held against it
         return NOTHING
     frozen = (stale > 0.5) & _repeats(y) & _moved(log, rows, y, step)
-    jump = _short((p < 0.5) & far & ~_repeats(y) & jumps, t)
+    jump = _short((p < 0.5) & far & ~_repeats(y) & jumps, t) | wrong
     found = np.flatnonzero(frozen | jump)
     if found.size > 0.5 * rows.size:  # then the model is wrong, not the receiver
         return NOTHING
@@ -169,11 +172,17 @@ def _model(t: Floats, y: Floats, step: Floats, fix: float, push: float) -> tuple
     return Linear(A, None, C, Gaussian(Q), Gaussian(variance), x0, loss=loss, dt=float(h[0])), Record(t, y)
 
 
-def _probabilities(t: Floats, y: Floats, step: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Return P(received), P(stale) and whether each fix lies far from the path.
+def _probabilities(
+    t: Floats, y: Floats, step: Floats, believed: NDArray[np.bool_]
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return P(received), P(stale) and whether each fix lies far from the path; 0 and False where it is not believed.
 
     The noise is what explains the log's first part best.
     """
+    if not believed.all():
+        found = np.zeros((3, t.size))
+        found[:, believed] = _probabilities(t[believed], y[believed], step, np.ones(int(believed.sum()), dtype=bool))
+        return found[0], found[1], found[2] > 0
     few = slice(0, min(t.size, _TRIED))
     best, most = (_FIX[0], _PUSH[0]), -np.inf
     for fix in _FIX:

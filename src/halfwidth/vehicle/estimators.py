@@ -357,15 +357,18 @@ def with_limits(asked: Method | None, limits: Mapping[str, Any] | None, roads: S
     Raises
     ------
     BadValue
-        If another method was asked for, or a limit is none.
+        If another method was asked for, a limit is none, or is of altitude or pitch in two dimensions.
     """
-    chosen = METHODS["paper002"] if asked is None else asked
+    held = antennas.limits_of(limits or {})
+    high = [name for name in ("altitude", "pitch") if name in held]
+    chosen = METHODS["paper002-3d" if high else "paper002"] if asked is None else asked
     if chosen.name not in ("paper002", "paper002-3d"):
         raise BadValue(
             f"`method` is {chosen.name!r}, but limits, a map and a second antenna are for the two-antenna model",
             hint='method="paper002"',
         )
-    held = antennas.limits_of(limits or {})
+    if high and chosen.name == "paper002":
+        raise BadValue(f"`limits` has {high[0]!r}, which `paper002` does not estimate", hint='method="paper002-3d"')
     settings = TwoAntennas(height=chosen.name == "paper002-3d", limits=held, roads=roads)
     return replace(chosen, run=antennas_by(settings))
 

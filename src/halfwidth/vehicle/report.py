@@ -882,12 +882,21 @@ def _tested(track: Track) -> str:
     share = sum(w * float(row["coverage"]) for w, row in zip(weights, rows, strict=True)) / sum(weights)
     low, high = (f"{pick(float(row['length_s']) for row in rows):.3g}" for pick in (min, max))
     lengths = low if low == high else f"{low} to {high}"
-    wider = max(float(row.get("inflation", 1.0)) for row in rows)
-    return (
+    factors = [float(row.get("inflation", 1.0)) for row in rows]
+    least, most = min(factors), max(factors)
+    said = (
         f" Tested on this very log: with its own fixes hidden for {lengths}\u00a0s and filled again,"
         f" {100 * share:.0f}\u00a0% of them lay inside"
-        + (f" before half-widths were widened, up to {wider:.1f}\u00a0times." if wider > 1.05 else ".")
     )
+    if least > 0.95 and most < 1.05:
+        return said + "."
+    if most < 1.05:
+        how = f"narrowed, to {least:.2g}"
+    elif least > 0.95:
+        how = f"widened, up to {most:.1f}"
+    else:
+        how = f"narrowed or widened, {least:.2g} to {most:.1f}"
+    return f"{said} before half-widths were {how}\u00a0times, so that {100 * track.level:.3g}\u00a0% do."
 
 
 def _records(value: Any) -> list[dict[str, Any]]:

@@ -4,7 +4,9 @@ A broken telegram gives a speed of 120 m/s for a tenth of a second; a bus that h
 and leaps to the true one afterwards. Either bends the path by metres and spoils the calibration of the sensor, and no
 test of fixes names it. One or two samples are a spike if they are further from the median of five neighbours than a car
 can change in that time, and than ten times what is usual. Equal samples for a second or more are stuck if the value
-before or after them is out of a car's reach; a car that cruises ends that smoothly. Leaps to and from 0 prove nothing.
+before or after them leaps: out of a car's reach, or by three times what all but a hundredth of the log's changes are,
+or, where the samples stay equal for three times as long as anywhere else, by more than the log's usual change. A car
+that cruises ends that smoothly. Leaps to and from 0 prove nothing.
 """
 
 from collections.abc import Mapping
@@ -31,6 +33,10 @@ _WINDOW = 5
 
 #: Equal samples are stuck from so many of them and so many seconds on.
 _STUCK, _STUCK_S = 5, 1.0
+
+#: A leap is so many times what all but a hundredth of the changes are; where samples stay equal for so many times as
+#: long as anywhere else, so many times the usual change; a log needs so many changes to say what is usual.
+_OFTEN, _LONGER, _MORE, _CHANGES = 3.0, 3.0, 1.5, 50
 
 #: No car turns like this for a twentieth of the time, rad/s: the stream is in degrees.
 _IN_DEGREES = 2.0
@@ -113,15 +119,25 @@ def spikes(log: Log) -> Spikes:
         if 0 < spike.sum() <= max(1.0, _MANY * rows.size):
             found[name] = rows[spike]
             rows, t, values = rows[~spike], t[~spike], values[~spike]
-        # a car may stand for as long as it likes, and a coarse log may stop it at once
-        leap = (np.abs(np.diff(values)) > at_once + rate * np.diff(t)) & (values[1:] != 0) & (values[:-1] != 0)
         begin = np.flatnonzero(np.concatenate(([True], np.diff(values) != 0)))
         end = np.concatenate((begin[1:], [values.size])) - 1
-        long = (end - begin + 1 >= _STUCK) & (t[end] - t[begin] >= _STUCK_S)
-        first, last = begin[long], end[long]
-        leaps = np.concatenate(([False], leap, [False]))
-        odd = leaps[first] | leaps[last + 1]
-        runs = [rows[a : b + 1] for a, b in zip(first[odd], last[odd], strict=True)]
+        held = t[end] - t[begin]
+        long = (end - begin + 1 >= _STUCK) & (held >= _STUCK_S)
+        change = np.abs(np.diff(values))
+        # a car may stand for as long as it likes, and a coarse log may stop it at once
+        leap = np.where((values[1:] != 0) & (values[:-1] != 0), change, 0.0)
+        leap = np.concatenate(([0.0], leap, [0.0]))
+        leap, reach = np.maximum(leap[begin], leap[end + 1]), at_once + rate * float(np.median(np.diff(t)))
+        changes = change[change > 0]
+        if changes.size >= _CHANGES:
+            reach = min(reach, _OFTEN * float(np.quantile(changes, 0.99)))
+            other = np.partition(held[values[begin] != 0], -2)[-2] if np.sum(values[begin] != 0) > 1 else np.inf
+            alone = held > _LONGER * max(other, _STUCK_S)
+            odd = long & ((leap > reach) | (alone & (leap > _MORE * float(np.median(changes)))))
+        else:
+            odd = long & (leap > reach)
+        first, last = begin[odd], end[odd]
+        runs = [rows[a : b + 1] for a, b in zip(first, last, strict=True)]
         if runs and sum(run.size for run in runs) <= _MANY_STUCK * rows.size:
             stuck[name] = runs
     return Spikes(found, stuck)

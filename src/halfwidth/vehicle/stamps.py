@@ -23,6 +23,7 @@ from halfwidth.vehicle import evidence
 from halfwidth.vehicle.log import STREAMS, Log
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 #: Samples that a stream needs, and over how many of them its period is measured.
 FEWEST, SPAN = 100, 50
@@ -33,6 +34,13 @@ SLACK, REGULAR = 2e-3, 0.9
 #: Steps between fixes that must have changed, by this share of the period, for the log to decide; how much nearer the
 #: speed must come to the fixes there.
 CHANGED, BY, BETTER = 20, 0.05, 0.9
+
+#: Where fixes are further apart than this, s, so many distances are enough.
+SLOW, CHANGED_SLOW = 0.5, 8
+
+#: Fixes that are compared lie so far apart, s, neighbours at least; a logger hangs for so long at most, s; none of the
+#: distances may say the contrary by this share.
+APART, LATEST, NO_WORSE = (0.0, 1.0, 3.0), 20.0, 1.05
 
 #: Rows may not pass fixes; where they would have to by more than this share of the period the streams are late each by
 #: itself, and stay as they are.
@@ -160,24 +168,40 @@ def _said(log: Log) -> Floats | None:
 
 
 def _fits_better(log: Log, said: Floats) -> bool:
-    """Whether the distances between neighbouring fixes are nearer to speed times time once the rows are moved."""
+    """Whether distances between fixes are nearer to speed times time once the rows are moved.
+
+    Neighbours show a jitter of every stamp; fixes some seconds apart a logger that hangs, where the error of the fixes
+    hides it from neighbours. One of them must say so clearly, and none the contrary.
+    """
     rows = np.flatnonzero(log.fixed)
     clock, speed = log.stream("speed_mps")
     if clock.size < FEWEST:
         return False
     east, north = evidence.local_metres(log.lat_deg[rows], log.lon_deg[rows])
-    moved = np.hypot(np.diff(east), np.diff(north))
-    usual = float(np.median(np.diff(log.t[rows])))
-    pace = np.interp(log.t[rows], clock, np.abs(speed))
-    pace = 0.5 * (pace[1:] + pace[:-1])
-    step, new = np.diff(log.t[rows]), np.diff(said[rows])
-    moving = pace > 1.0
-    told = (np.abs(new - step) > BY * usual) & moving
-    if int(told.sum()) < CHANGED:
-        return False
+    t, new = log.t[rows], said[rows]
+    usual = float(np.median(np.diff(t)))
+    pace = np.interp(t, clock, np.abs(speed))
+    gains = []
+    for apart in sorted({max(1, round(seconds / usual)) for seconds in APART}):
+        if apart >= rows.size:
+            break
+        moved = np.hypot(east[apart:] - east[:-apart], north[apart:] - north[:-apart])
+        # the distance is that of the fixes in between, too, where the speed changes
+        mean = np.convolve(pace, np.r_[0.5, np.ones(apart - 1), 0.5] / apart, mode="valid")
+        before, after = t[apart:] - t[:-apart], new[apart:] - new[:-apart]
+        # neither standing nor across a gap
+        moving = (mean > 1.0) & (before < 2.0 * apart * usual + LATEST)
+        told = (np.abs(after - before) > BY * usual * apart) & moving
+        if int(told.sum()) < (CHANGED if usual < SLOW else CHANGED_SLOW):
+            continue
 
-    def off(h: Floats) -> float:
-        scale = float(np.median(moved[moving] / (pace * h)[moving]))
-        return float(np.median(np.abs(moved - scale * pace * h)[told]))
+        gains.append(
+            _misfit(moved, mean * after, moving, told) / max(_misfit(moved, mean * before, moving, told), 1e-12)
+        )
+    return bool(gains) and min(gains) < BETTER and max(gains) < NO_WORSE
 
-    return off(new) < BETTER * off(step)
+
+def _misfit(moved: Floats, reckoned: Floats, moving: Mask, told: Mask) -> float:
+    """Return by how much distances usually differ from those reckoned, up to one scale."""
+    scale = float(np.median(moved[moving] / reckoned[moving]))
+    return float(np.median(np.abs(moved - scale * reckoned)[told]))

@@ -6,7 +6,9 @@ to doubt (the first seconds after a gap, the last ones before it, and what follo
 the doubtful fixes are hidden, and the chain, with the noise that the drive was found to have, says where they should
 have been: after a gap from the fixes after them alone, before it from those before them, so that a gap badly bridged
 proves nothing. What is further off than that can be wrong goes, up to the first fix that agrees again. If none agrees
-the fixes are believed: then the reckoning is wrong, or they are all that is known.
+the fixes are believed: then the reckoning is wrong, or they are all that is known. They are believed, too, if a jump of
+the receiver's own slow error explains the drive as well (a correction arrives, a satellite is lost): without them the
+path would be bent all the way through the gap.
 """
 
 from collections.abc import Sequence
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 
 from halfwidth.vehicle import chain
 from halfwidth.vehicle.grid import Grid
+from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pointing import azimuth_of
 from halfwidth.vehicle.sensors import Calibration
 
@@ -51,8 +54,9 @@ _CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 1.6, 2.
 #: Scale of what the calibration takes to be without noise.
 _NO_NOISE = 1e-4
 
-#: Share of that distance that must be left when both sides of a gap are asked.
-_BOTH = 0.5
+#: How much of the drive on each side of a gap tells wrong fixes from a jump, s; the chain that is asked; how far wrong
+#: fixes may be off, m; and with how many numbers an axis.
+_SIDE, _JUDGE, _WIDE, _SHAPE = 60.0, chain.Chain(rounds=16), 10.0, 3
 
 #: Scale and bias are known to this many of their standard deviations, and no better than this.
 _KNOWN, _SCALE, _BIAS = 3.0, 0.003, 0.001
@@ -150,6 +154,7 @@ class _Doubt:
     block: tuple[int, int]  # fixes without a gap among them
     before: bool  # whether the fixes before them are asked where they should have been
     after: bool  # and those after them
+    known: bool = False  # whether others beside them are known to be wrong
 
     @property
     def backwards(self) -> bool:
@@ -172,7 +177,6 @@ class _Wrong:
     """Fixes that are wrong by what was said about one doubt."""
 
     clear: float  # how many standard deviations the furthest is off
-    doubted: NDArray[np.intp]
     nodes: NDArray[np.intp]
     distance: Floats
 
@@ -184,7 +188,7 @@ class _Search:
         self.grid, self.seen, self.settings, self.noise = grid, seen, settings, noise
         self.size = np.zeros(len(grid))
         self.gone = np.zeros(len(grid), dtype=bool)
-        self._usual: dict[tuple[bool, bool, float], float] = {}
+        self._asked: dict[tuple[bool, bool, float], Floats] = {}
 
     def look(self, doubts: Sequence[_Doubt], share: float = 1.0) -> list[_Doubt]:
         """Find which of the doubtful fixes are wrong; return the doubts that had some, moved on to the next fix.
@@ -196,19 +200,20 @@ class _Search:
             doubt, nodes = answer.doubt, answer.nodes
             if not _wrong(answer, share).any():
                 continue
-            wrong = _wrong(answer, share * self._unusual(doubt, answer.length)) & ~self.gone[nodes]
+            usual = self._usual(doubt, answer.length)
+            wrong = _wrong(answer, share * _unusual(usual)) & ~self.gone[nodes]
             if wrong.any():
                 distance, sd = answer.off[-1]
                 clear = float((distance / sd)[wrong].max())
                 if doubt not in clearest or clear > clearest[doubt].clear:
-                    clearest[doubt] = _Wrong(clear, nodes, nodes[wrong], distance[wrong])
+                    clearest[doubt] = _Wrong(clear, nodes[wrong], distance[wrong])
         left = []
         for doubt, stray in self._confirmed(clearest).items():
             self.size[stray.nodes], self.gone[stray.nodes] = stray.distance, True
             rest = np.flatnonzero(~self.gone[self.seen[doubt.block[0] : doubt.block[1]]]) + doubt.block[0]
             rest = rest[rest <= doubt.first] if doubt.backwards else rest[rest >= doubt.first]
             if rest.size:
-                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0])))
+                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0]), known=True))
         return left
 
     def _ask(self, doubts: Sequence[_Doubt], lengths: Sequence[float]) -> list[_Answer]:
@@ -241,34 +246,47 @@ class _Search:
         ]
 
     def _confirmed(self, found: dict[_Doubt, "_Wrong"]) -> dict[_Doubt, "_Wrong"]:
-        """Ask the other side of the gap, too: what it puts right is not wrong."""
-        t, end = self.grid.t[self.seen], self.seen.size
-        hidden, parts = [], []
-        for doubt, wrong in found.items():
-            mask = self.gone.copy()
-            mask[wrong.doubted] = True
-            here = t[doubt.first]
-            back, ahead = (AROUND, AROUND + DOUBTED[-1]) if doubt.after else (AROUND + DOUBTED[-1], AROUND)
-            start = np.searchsorted(t, min(here, t[max(doubt.block[0] - 1, 0)]) - back)
-            stop = np.searchsorted(t, max(here, t[min(doubt.block[1], end - 1)] if not doubt.after else here) + ahead)
-            parts.append(slice(int(self.seen[start]), int(self.seen[min(int(stop), end - 1)]) + 1))
-            hidden.append(self.grid.rows(parts[-1]).masked(mask[parts[-1]]))
-        fits = chain.solve(hidden, self.settings, sigma=self.noise, learn=False) if hidden else []
-        kept = {}
-        for (doubt, wrong), part, fit in zip(found.items(), parts, fits, strict=True):
-            both, _ = _off(self.grid, wrong.nodes, part, fit)
-            if float(np.median(both)) > _BOTH * float(np.median(wrong.distance)):
-                kept[doubt] = wrong
-        return kept
+        """Keep the doubts in which wrong fixes explain the drive better than a jump of the receiver's slow error.
 
-    def _unusual(self, doubt: _Doubt, length: float) -> float:
-        """Return how many times further off than `FAR` fixes must be that are doubted like this.
+        The chain that knows such jumps learns from the drive around the gap as it is, and from the same with the
+        doubtful fixes put back by as much as they are off: by a constant, a trend and a bend, as far as they are
+        enough. The likelihood must grow by more than what these numbers are worth: each the logarithm of how little of
+        `_WIDE` is left for it. Next to fixes that are wrong it need only grow. In the middle of fixes both sides were
+        asked before.
+        """
+        asked = [doubt for doubt in found if doubt.before != doubt.after]
+        parts = [self._around(doubt, found[doubt].nodes) for doubt in asked]
+        here = [self.grid.rows(part).masked(self.gone[part]) for part in parts]
+        own = [found[doubt].nodes - part.start for doubt, part in zip(asked, parts, strict=True)]
+        hidden = [drive.masked(np.isin(np.arange(len(drive)), k)) for drive, k in zip(here, own, strict=True)]
+        without = chain.solve(hidden, _JUDGE) if asked else []
+        moved = [_put_back(drive, k, fit.path) for drive, k, fit in zip(here, own, without, strict=True)]
+        fits = chain.solve([*here, *moved], _JUDGE) if asked else []
+        gain = [_likely(fit, drive) for fit, drive in zip(fits, [*here, *moved], strict=True)]
+        better = dict(found)
+        for i, (doubt, k, fit) in enumerate(zip(asked, own, without, strict=True)):
+            numbers = 0 if doubt.known else 2 * min(k.size, _SHAPE)
+            spread = fit.path.variance
+            left = np.nan if spread is None else float(np.sqrt(np.median(spread[k])))
+            if gain[len(asked) + i] - gain[i] < numbers * max(np.log(_WIDE / left), 0.0):
+                del better[doubt]
+        return better
 
-        The chain's own deviations are too small on a log whose errors are not as it takes them. How far fixes are off
-        that nobody doubts, all along the drive, says by how much.
+    def _around(self, doubt: _Doubt, nodes: NDArray[np.intp]) -> slice:
+        """Return the nodes around a gap with doubtful fixes at one of its ends."""
+        t, at = self.grid.t[self.seen], np.searchsorted(self.seen, nodes)
+        first, last = (doubt.block[0] - 1, at[-1] + 1) if doubt.after else (at[0] - 1, doubt.block[1])
+        begin = int(np.searchsorted(t, t[max(int(first), 0)] - _SIDE))
+        end = int(np.searchsorted(t, t[min(int(last), t.size - 1)] + _SIDE))
+        return slice(int(self.seen[begin]), int(self.seen[end - 1]) + 1)
+
+    def _usual(self, doubt: _Doubt, length: float) -> Floats:
+        """Return how many standard deviations fixes are off at most that nobody doubts, at places all along the drive.
+
+        The chain's own deviations are too small on a log whose errors are not as it takes them; these say by how much.
         """
         kind = doubt.before, doubt.after, length
-        if kind not in self._usual:
+        if kind not in self._asked:
             room = length + AROUND / 2
             t = self.grid.t[self.seen]
             controls = []
@@ -284,12 +302,42 @@ class _Search:
                     for k in firsts
                     if not self.gone[self.seen[k]]
                 ]
-            answers = self._ask(controls, (length,))
-            most = [float(np.min([distance / sd for distance, sd in one.off], axis=0).max()) for one in answers]
-            enough = len(most) >= _FEWEST_CONTROLS
-            usual = float(np.quantile(most, _QUANTILE)) if enough else _UNKNOWN * FAR
-            self._usual[kind] = max(1.0, _MARGIN * usual / FAR if enough else _UNKNOWN)
-        return self._usual[kind]
+            self._asked[kind] = np.array([_most(one) for one in self._ask(controls, (length,))])
+        return self._asked[kind]
+
+
+def _put_back(drive: Grid, own: NDArray[np.intp], path: Path) -> Grid:
+    """Return a drive with the fixes of some nodes moved by the smooth part of what they are off a path."""
+    t = drive.t[own] - drive.t[own].mean()
+    shape = np.vander(t / max(float(np.ptp(t)), 1e-9), min(own.size, _SHAPE))
+    off = np.column_stack((drive.east - path.east, drive.north - path.north))[own]
+    if not np.isfinite(off).all():
+        return drive
+    smooth = shape @ np.linalg.lstsq(shape, off, rcond=None)[0]
+    east, north = drive.east.copy(), drive.north.copy()
+    east[own], north[own] = east[own] - smooth[:, 0], north[own] - smooth[:, 1]
+    return replace(drive, east=east, north=north)
+
+
+def _likely(fit: chain.Fit, drive: Grid) -> float:
+    """Return the log-likelihood of the fixes of a drive, with Student's distribution of the increments of the offset.
+
+    To that given their weights w comes what the weights cost, (tail / 2) (log w - w + 1) each: with the best weight
+    it is the logarithm of Student's density, but for a constant.
+    """
+    weight = fit.weight[1:][~chain.in_gap(drive)[1:]]
+    return fit.loglik + 0.5 * _JUDGE.tail * float(np.sum(np.log(weight) - weight + 1.0))
+
+
+def _most(answer: _Answer) -> float:
+    """Return how many standard deviations the furthest of the fixes is off, by the side that says the least."""
+    return float(np.min([distance / sd for distance, sd in answer.off], axis=0).max())
+
+
+def _unusual(usual: Floats) -> float:
+    """Return how many times further off than `FAR` fixes must be, from how far off others are."""
+    enough = usual.size >= _FEWEST_CONTROLS
+    return max(1.0, _MARGIN * float(np.quantile(usual, _QUANTILE)) / FAR if enough else _UNKNOWN)
 
 
 def _off(grid: Grid, nodes: NDArray[np.intp], part: slice, fit: chain.Fit) -> tuple[Floats, Floats]:
