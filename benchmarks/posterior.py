@@ -9,7 +9,7 @@ Kalman filter sees 15 rows. `streams`: long paths by `Window(Posterior())`, whic
 Kalman filter on the same rows, after a burn-in of 200 rows; whole paths of that length cannot be rejected, so one is the
 genealogy of a particle among 5,000 that are resampled from those inside at every row. `table` is both; without arguments
 it is printed. `outliers` redraws disturbances that would leave the boxes, which is another law. `calibration` draws
-half-widths from the prior that is used, without bounds. `WINDOWS=500` sets the number of windows; streams have six times
+half-widths from the prior that is used, without bounds. `WINDOWS=500` sets the number of windows; streams have twelve times
 as many. `PICTURES=folder` writes the diagrams of `calibration` and `pictures` there.
 """
 
@@ -224,8 +224,10 @@ def streams():
     for delta in (5, 25, 50):
         show(f"stream, Delta {delta}", stream_case(delta))
         show(f"stream, Delta {delta}, told q, r", stream_case(delta, model=known))
-    show("stream, Delta 25, 20 % missing", stream_case(25, missing=0.2))
-    show("stream, Delta 25, E and F", stream_case(25, correlated=True))
+    for name, more in (("20 % missing", {"missing": 0.2}), ("E and F", {"correlated": True})):
+        show(f"stream, Delta 25, {name}", stream_case(25, **more))
+        told = system(hw.Uniform(Q), hw.Uniform(R), correlated="correlated" in more)
+        show("  the same, told q, r", stream_case(25, model=told, **more))
 
 
 def against_draws():

@@ -49,9 +49,11 @@ from halfwidth.spread import Box, Normal, Shaped
 
 _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
-POWER = 0.5
+POWER = 0.75
 #: Nodes of a stage, and most stages (core/ep_learn.hpp).
 _STAGE, _STAGES = 16, 8
+#: Numbers that the beliefs of all nodes may take up; one stage is always had.
+_ROOM = 4e6
 #: Of the search and the nodes. The mode of the window before is a good centre of nodes up to the distance `near`, in
 #: standard deviations.
 _LIMITS = {
@@ -281,7 +283,9 @@ class Posterior:
         limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
         if rows > _LONG:
             limits |= _OF_LONG
-        z = nodes(q, 1 if q == 0 else min(self.nodes, _STAGE) if rows > _LONG else self.nodes)
+        n = len(chain.problem["m0"])
+        room = int(_ROOM / (len(chain.problem["start"]) * n * (n + 3)))
+        z = nodes(q, 1 if q == 0 else min(self.nodes, max(room, _STAGE)))
         if q == 0:
             limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
