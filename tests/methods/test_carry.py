@@ -113,7 +113,7 @@ def test_no_row_speaks_twice():
         known = carried.known(newest - 9, 10)
         gone = max(newest - 9, 0)
         assert (0.0 if known is None else known.precision[0, 0]) <= gone / 10 + 1e-9
-        carried.waiting.append((newest, Known.none(1).plus(one, 0.1)))
+        carried.waiting.append((newest, one.times(0.1), Known.none(1)))
     assert carried.gone.precision[0, 0] == pytest.approx(3.0)
 
 

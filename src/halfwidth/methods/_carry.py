@@ -12,9 +12,9 @@ likelihoods is a composite likelihood: its slope has mean 0 at the truth as each
 exp(-1 / rows) a row.
 
 As a factor of the evidence bounds count as an event that small half-widths make likely, and over many windows that adds
-up. So they are a condition in all rows but 26, those of the newest window and those that have left alike (`condition`): a
-quadratic of log P(inside | u), the evidence of the chain with its bounds alone, is taken off. It is found anew in every
-N-th window.
+up. So they are a condition in all rows but 26, those of the newest window and those that have left alike
+(`condition`): a quadratic of log P(inside | u), the evidence of the chain with its bounds alone, is taken off. It is
+found anew in every N-th window.
 
 The state before the first row of a window is what the sites of the rows that have left make of it: the forwards message
 of expectation propagation, a Gaussian.

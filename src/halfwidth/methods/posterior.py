@@ -12,18 +12,18 @@ Staying inside `bounds` is an event that small half-widths make likely: over man
 The prior has no scale: where a noise drowns in the others told ~ s^2 and the prior falls to 0, where it is seen told
 is 1 and the prior is a power. `power` is what a study of coverage gave in windows of 6, 26 and 51
 rows (benchmarks/posterior.py).
-Weighted nodes carry what is not known of s into the intervals: stages of normal points, the first about the mode, each
-later one with the moments of all before it, weighted by evidence over the mixture of the stages (core/ep_learn.hpp). The
-evidence of a node has what expectation propagation leaves out of it to second order, without which half-widths are
-learned with a bias; first-order corrections of skewness and kurtosis bend the Gaussian marginals to the light tails that
-bounded noise has.
+Weighted nodes carry what is not known of s into the intervals: stages of normal points, the first about the mode,
+each later one with the moments of all before it, weighted by evidence over the mixture of the stages
+(core/ep_learn.hpp). The evidence of a node has what expectation propagation leaves out of it to second order, without
+which half-widths are learned with a bias. First-order corrections of skewness and kurtosis bend the Gaussian marginals
+to the light tails that bounded noise has.
 
 References
 ----------
 Minka (2001), Expectation propagation for approximate Bayesian inference, UAI. Opper, Paquet and Winther (2013),
 Perturbative corrections for approximate inference in Gaussian latent variable models, JMLR 14. Durbin and Koopman
-(2001), ch. 4: the disturbance smoother that gives every cavity. Cornuet, Marin, Mira and Robert (2012), Adaptive multiple
-importance sampling, Scandinavian Journal of Statistics 39. Model: Pavelková and Kárný (2013), eqs. (1), (2).
+(2001), ch. 4: the disturbance smoother that gives every cavity. Cornuet, Marin, Mira and Robert (2012), Adaptive
+multiple importance sampling, Scandinavian Journal of Statistics 39. Model: Pavelková and Kárný (2013), eqs. (1), (2).
 """
 
 import functools
@@ -49,7 +49,7 @@ from halfwidth.spread import Box, Normal, Shaped
 
 _STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
-POWER = 0.75
+POWER = 0.6
 #: Nodes of a stage, and most stages (core/ep_learn.hpp).
 _STAGE, _STAGES = 16, 8
 #: Numbers that the beliefs of all nodes may take up; one stage is always had.
@@ -57,8 +57,8 @@ _ROOM = 4e6
 #: Of the search and the nodes. The mode of the window before is a good centre of nodes up to the distance `near`, in
 #: standard deviations.
 _LIMITS = {
-    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "near": 0.8, "least": 2.0,
-    "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
+    "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "near": 0.8,
+    "least": 2.0, "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
     "stage": _STAGE, "enough": 0.06, "usable": 0.1,
 }  # fmt: skip
 #: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
