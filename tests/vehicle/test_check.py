@@ -51,7 +51,7 @@ def test_a_good_log_is_good(tmp_path):
             "radians counter-clockwise",
             "--columns 'azimuth=-azimuth_rad[rad]'",
         ),
-        ({"azimuth_rad": lambda v: np.pi / 2 - v}, "azimuth", "counter-clockwise from east", ""),
+        ({"azimuth_rad": lambda v: np.pi / 2 - v}, "azimuth", "counter-clockwise from east", "halfwidth fill"),
         ({"azimuth_rad": lambda v: v + 1.0}, "azimuth", "no known convention explains it", ""),
     ],
 )
@@ -59,9 +59,9 @@ def test_each_fault_is_named_with_what_to_type(changes, item, words, line, tmp_p
     found = checked(tmp_path, **changes)
     assert found[item].verdict == "bad"
     assert words in found[item].sentence
-    assert found[item].line == line
+    assert found[item].line[: len(line) or None] == line
     assert found.verdict == "bad"
-    if line:
+    if line.startswith("--columns"):
         # what is to be typed puts it right
         again = hw.vehicle.read(found.source, columns=line.split("'")[1], repair=False)
         assert hw.vehicle.check(again)[item].verdict == "ok"
@@ -102,6 +102,17 @@ def test_outliers_are_counted_and_placed(tmp_path):
     assert found["outliers"].verdict == "warn"
     assert found["outliers"].value == 1
     assert "at 70.0 s" in found["outliers"].sentence
+    assert found["outliers"].line.startswith("halfwidth fill")
+
+
+def test_what_follows_a_freeze_is_no_outlier(tmp_path):
+    columns = drive(fix_noise=0.05)
+    held = (columns["t_s"] > 60) & (columns["t_s"] < 68)
+    for name in ("lat_deg", "lon_deg"):
+        columns[name][held] = columns[name][held][0]
+    found = hw.vehicle.check(save(tmp_path / "log.csv", columns))
+    assert "repeat the fix before" in found["trust"].sentence
+    assert found["outliers"].verdict == "ok"
 
 
 def test_missing_streams_and_pauses_are_said(tmp_path):

@@ -220,6 +220,41 @@ def test_faults_at_one_hertz(drive, clean, fault):
     assert fault == "first fixes" or said(track, FAULTS[fault][1])
 
 
+def hung(log):
+    """The log with a logger that hangs before the first gap, and works off what waits."""
+    late = np.where(log.t < 90.0, 0.0, np.clip(1.2 * (1 - (log.t - 90.0) / 12.0), 0.0, 1.2))
+    return replace(log, t=log.t + late)
+
+
+@pytest.mark.parametrize("both", [("degrees", "freeze"), ("km/h", "first fixes")], ids=" and ".join)
+def test_a_logger_that_hangs_and_other_faults_are_survived_together(drive, clean, both):
+    truth, log = drive
+    wrong = log
+    for name in both:
+        wrong = FAULTS[name][0](wrong)
+    track = fill(hung(wrong))
+    assert said(track, "s late")
+    for name in both:
+        assert said(track, FAULTS[name][1]), name
+    when = np.interp(track.t_s, hung(log).t, log.t)
+    inside = np.zeros(when.size, dtype=bool)
+    for first, last in GAPS:
+        inside |= (when >= first) & (when <= last)
+    off = truth.error_m(when[inside], track.lat_deg[inside], track.lon_deg[inside])
+    assert float(np.hypot(*off).max()) < 2 * clean + 1.0
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_a_speed_that_is_stuck_below_a_cars_reach_is_named(seed):
+    _, log = simulate_drive(seed=seed, **DRIVE)
+    rows = np.flatnonzero((log.t > 101.0) & (log.t < 112.0))
+    stuck = log.speed_mps.copy()
+    # as fast as one second after the end, and 1.8 m/s more: a car of 12 m/s2 could do that in two samples
+    stuck[rows] = stuck[rows[-1] + 1] + 1.8
+    track = fill(replace(log, speed_mps=stuck))
+    assert said(track, "the speed is stuck and then leaps")
+
+
 def test_without_a_speed_a_jump_is_still_found(drive):
     truth, log = drive
     bare = replace(log, speed_mps=np.full(len(log), np.nan))

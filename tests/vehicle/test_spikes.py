@@ -64,6 +64,18 @@ def test_a_sensor_is_stuck_for_longer_than_it_ever_holds_a_value(rate):
     assert found.size >= 0.9 * n
 
 
+def test_a_speed_that_is_stuck_until_the_car_stands_is_found_and_a_halt_at_once_is_not():
+    _, log = simulate_drive(duration=300, seed=3, tunnels=())
+    speed = log.speed_mps
+    stands = np.flatnonzero((speed[1:] == 0) & (speed[:-1] > 0)) + 1
+    end = int(stands[stands > 200][0])
+    fast = np.flatnonzero(speed[:end] > 8)[-1]
+    (found,) = spikes(with_samples(log, "speed_mps", slice(fast, end), speed[fast])).stuck["speed_mps"]
+    assert found[-1] == end - 1
+    moving = np.flatnonzero((speed[:-60] > 8) & (speed[60:] > 8))
+    assert len(spikes(with_samples(log, "speed_mps", slice(moving[0], moving[0] + 60), 0.0))) == 0
+
+
 @pytest.mark.parametrize("seed", range(20, 24))
 @pytest.mark.parametrize(("rate", "step"), [(50.0, 1 / 3.6), (10.0, 0.25), (1.0, 1 / 3.6)])
 def test_coarse_streams_hold_their_values_in_peace(seed, rate, step):

@@ -166,8 +166,8 @@ def check(log: Any) -> Check:
         names = ("outliers", "speed", "azimuth", "yaw rate", "trust", "stamps", *check_sensors.NAMES)
         moving = [Item(name, "not checked", first) for name in names]
     else:
-        moving = [_outliers(log), _speed(log), _azimuth(log), _yaw(log)]
         trust, believed = _trust(log)
+        moving = [_outliers(believed), _speed(log), _azimuth(log), _yaw(log)]
         row = matched_factor(evidence.speed_ratio(log))
         if row is not None and row[3] != 1:
             first = "put the time right first"
@@ -309,6 +309,7 @@ def _outliers(log: Log) -> Item:
         "bad" if share > 0.05 else "warn",
         f"{int(bad.sum())} of {bad.size} fixes jump further than a speed of {top:.0f} m/s explains, at {times}{more} s",
         float(bad.sum()),
+        line=check_sensors.fill_line(log),
     )
 
 
@@ -359,7 +360,8 @@ def _speed(log: Log) -> Item:
     if abs(found.value - 1) > 0.1:
         return Item("speed", "bad", f"{text}, 1 is expected and no known unit explains it", found.value, "", "", shown)
     if abs(found.value - 1) > 0.04:
-        return Item("speed", "warn", f"{text}, 1 is expected", found.value, "", "", shown)
+        # a scale that `fill` finds
+        return Item("speed", "warn", f"{text}, 1 is expected", found.value, "", check_sensors.fill_line(log), shown)
     return Item("speed", "ok", text, found.value, "", "", shown)
 
 
@@ -375,7 +377,7 @@ def _azimuth(log: Log) -> Item:
     convention = contradicted_convention(log)
     if convention is not None:
         degrees_given = convention.startswith("degrees")
-        line = ""
+        line = check_sensors.fill_line(log)  # which turns what is counted from east
         if convention.endswith("clockwise from north"):
             sign = "-" if "counter" in convention else ""
             line = _typed(log, "azimuth_rad", "deg" if degrees_given else "rad", sign)

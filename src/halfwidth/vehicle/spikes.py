@@ -6,7 +6,8 @@ test of fixes names it. One or two samples are a spike if they are further from 
 can change in that time, and than ten times what is usual. Equal samples for a second or more are stuck if the value
 before or after them leaps: out of a car's reach, or by three times what all but a hundredth of the log's changes are,
 or, where the samples stay equal for three times as long as anywhere else, by more than the log's usual change. A car
-that cruises ends that smoothly. Leaps to and from 0 prove nothing.
+that cruises ends that smoothly. A speed of 0 is never stuck, as a car stands for as long as it likes, and of a leap to
+or from 0 what a sensor may be blind for does not count.
 """
 
 from collections.abc import Mapping
@@ -37,6 +38,9 @@ _STUCK, _STUCK_S = 5, 1.0
 #: A leap is so many times what all but a hundredth of the changes are; where samples stay equal for so many times as
 #: long as anywhere else, so many times the usual change; a log needs so many changes to say what is usual.
 _OFTEN, _LONGER, _MORE, _CHANGES = 3.0, 3.0, 1.5, 50
+
+#: Below this a sensor may say 0: so much of a leap to or from 0 proves nothing.
+_BLIND = {"speed_mps": 2.0, "yaw_rate_radps": np.inf}
 
 #: No car turns like this for a twentieth of the time, rad/s: the stream is in degrees.
 _IN_DEGREES = 2.0
@@ -124,10 +128,11 @@ def spikes(log: Log) -> Spikes:
         held = t[end] - t[begin]
         long = (end - begin + 1 >= _STUCK) & (held >= _STUCK_S)
         change = np.abs(np.diff(values))
-        # a car may stand for as long as it likes, and a coarse log may stop it at once
-        leap = np.where((values[1:] != 0) & (values[:-1] != 0), change, 0.0)
+        still = (values[1:] == 0) | (values[:-1] == 0)
+        leap = np.where(still, np.maximum(change - _BLIND[name], 0.0), change)
         leap = np.concatenate(([0.0], leap, [0.0]))
-        leap, reach = np.maximum(leap[begin], leap[end + 1]), at_once + rate * float(np.median(np.diff(t)))
+        leap = np.where(values[begin] == 0, 0.0, np.maximum(leap[begin], leap[end + 1]))
+        reach = at_once + rate * float(np.median(np.diff(t)))
         changes = change[change > 0]
         if changes.size >= _CHANGES:
             reach = min(reach, _OFTEN * float(np.quantile(changes, 0.99)))
