@@ -131,6 +131,7 @@ class Carried:
         self.rows = 0.0  # rows that have left, faded
         self.waiting: list[tuple[int, Known, Known]] = []  # newest row of a window, and both, weighted
         self.inside = Known.none(p)  # bounds alone of the last window asked
+        self.given: Known | None = None  # what the newest window was told
         self.count = 0  # windows that told something
         self.start: Start | None = None
         self.first: Normal | None = None  # the state before the first row, once rows have left
@@ -146,9 +147,10 @@ class Carried:
             _, told, kept_in = self.waiting.pop(0)
             self.gone, self.kept_in = self.gone.plus(told), self.kept_in.plus(kept_in)
             self.rows += 1.0
-        if not self.rows:
-            return None
-        return self.gone.plus(self.kept_in.plus(self.inside), -condition(rows + self.rows))
+        self.given = None
+        if self.rows:
+            self.given = self.gone.plus(self.kept_in.plus(self.inside), -condition(rows + self.rows))
+        return self.given
 
     def leave(self, a: int) -> None:
         """Let go of the first a rows of the newest window: they tell the state that the next one begins at."""
