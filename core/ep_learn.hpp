@@ -28,6 +28,7 @@ constexpr int ep_alone = 10;  // sweeps of a chain with its bounds alone, which 
 constexpr int ep_stages = 8;  // most stages of points
 constexpr double ep_lean = 4.0;  // points that a first guess of their covariance is worth
 constexpr double ep_wide = 1.15;  // by how much a stage reaches farther than the posterior is thought to
+constexpr double ep_some = 10.0;  // effective points without which the evidence itself is in doubt
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
 template <class N>
@@ -685,7 +686,7 @@ struct EpLearner {
             if (nodes > 1) stages_used++;
             effective = weigh(phi, done, a.share, &log_sum);
             if (done == nodes) break;
-            if (effective > 0.0 && doubt(done, a.share, effective) < a.enough * a.enough) break;
+            if (effective > ep_some && doubt(done, a.share, effective) < a.enough * a.enough) break;
             if (effective > 0.0) refit(phi, done, a.share, effective, S);
             else stage[stages_used] = now;
         }
