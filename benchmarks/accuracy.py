@@ -16,13 +16,14 @@ import argparse
 import time
 from pathlib import Path
 
+import hidden
 import numpy as np
 
 import halfwidth as hw
 from halfwidth.vehicle.align import calibrated
-from halfwidth.vehicle.frames import Frame
 from halfwidth.vehicle.grid import sampled
 from halfwidth.vehicle.outage import LENGTHS
+from halfwidth.vehicle.stamps import restamped
 
 #: How much worse than the best single method `fill` may be.
 WORSE = 1.05
@@ -64,9 +65,8 @@ def asked_of(name, found):
 
 def held(log, found, lengths, most):
     """Hide one stretch at a time from `fill`; print error, share inside, and width; return errors by length."""
-    frame = Frame.of(log)
     nodes = sampled(log, sensors=calibrated(log))
-    times = nodes.t[nodes.seen]
+    times = nodes.t[nodes.seen]  # the fixes that `outages` compares with
     print(f"{'fill':12}{'tracks':>8}{'m':>16}{'inside':>9}{'half-width m':>14}{'s a track':>11}")
     errors = {}
     for length in lengths:
@@ -74,23 +74,15 @@ def held(log, found, lengths, most):
         means, largest, counts, inside, widths, seconds, which = [], [], [], [], [], [], []
         for k, t0 in enumerate(begin):
             clock = time.process_time()
-            track = hw.vehicle.fill(log.without(t0, t0 + length))
+            track = hw.vehicle.fill(hidden.without(log, [t0], length))
             seconds.append(time.process_time() - clock)
-            # the fixes that `outages` compares with
-            rows = np.searchsorted(log.t, times[(times >= t0) & (times <= t0 + length)])
-            at = np.searchsorted(track.t_s, log.t[rows])
-            # a hidden row that is no gap of its own has no row in the track
-            there = (at < len(track)) & (track.t_s[np.minimum(at, len(track) - 1)] == log.t[rows])
-            rows, at = rows[there], at[there]
-            if not rows.size:
+            off, half, _ = hidden.compared(log, track, t0, length, times)
+            if not off.size:
                 continue
-            off = np.column_stack(frame.to_local(track.lat_deg[at], track.lon_deg[at]))
-            off -= np.column_stack(frame.to_local(log.lat_deg[rows], log.lon_deg[rows]))
-            half = np.column_stack((track.east_half_m[at], track.north_half_m[at]))
             distance = np.hypot(off[:, 0], off[:, 1])
             means.append(distance.mean())
             largest.append(distance.max())
-            counts.append(rows.size)
+            counts.append(len(off))
             inside.append(np.mean(np.abs(off) <= half))
             widths.append(half.mean())
             which.append(k)
@@ -149,7 +141,8 @@ def main():
     if not logs:
         parser.error(f"{asked.folder} has no logs")
     for path in logs:
-        log = hw.vehicle.read(path)
+        # `outages` puts a log right that was written late; its starts are on that clock
+        log = restamped(hw.vehicle.read(path))[0]
         print(f"\n=== {path.name}")
         found = hw.vehicle.outages(log, lengths, asked.starts, asked.seed, methods)
         print(found, end="\n\n", flush=True)

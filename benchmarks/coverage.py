@@ -19,6 +19,7 @@ import argparse
 import time
 from pathlib import Path
 
+import hidden
 import numpy as np
 
 import halfwidth as hw
@@ -54,22 +55,12 @@ def places(log, length, rng):
 
 def one_run(log, begins, length, truth=None, drive=0, **how):
     """Remove gaps, fill, and return for each the errors and half-widths at the removed fixes, (n, 2) each."""
-    hidden = log
-    for begin in begins:
-        hidden = hidden.without(begin, begin + length)
-    track = hw.vehicle.fill(hidden, **how)
-    frame = Frame.of(log)
+    track = hw.vehicle.fill(hidden.without(log, begins, length), **how)
     found = []
     for begin in begins:
-        rows = np.flatnonzero(log.fixed & (log.t >= begin) & (log.t <= begin + length))
-        at = np.searchsorted(track.t_s, log.t[rows])
-        there = (at < len(track)) & (track.t_s[np.minimum(at, len(track) - 1)] == log.t[rows])
-        rows, at = rows[there], at[there]
-        if not rows.size:
+        off, half, at = hidden.compared(log, track, begin, length)
+        if not off.size:
             continue
-        off = np.column_stack(frame.to_local(track.lat_deg[at], track.lon_deg[at]))
-        off -= np.column_stack(frame.to_local(log.lat_deg[rows], log.lon_deg[rows]))
-        half = np.column_stack((track.east_half_m[at], track.north_half_m[at]))
         one = {"begin": begin, "length": length, "drive": drive, "off": off, "half": half, "level": track.level}
         if truth is not None:
             when = track.t_s[at] - truth.clock_offset  # the track is on the clock of the fixes

@@ -25,6 +25,7 @@ import numpy as np  # noqa: E402
 
 import halfwidth as hw  # noqa: E402
 from halfwidth.methods import posterior  # noqa: E402
+from halfwidth.methods._carry import Known  # noqa: E402
 from halfwidth.methods._sliding import Sliding, stacked  # noqa: E402
 from halfwidth.reproduce.paper003 import BOX, KAPPA, A, B, C, E, F, Q, R  # noqa: E402
 from halfwidth.spread import part as rows_of  # noqa: E402
@@ -473,31 +474,36 @@ def robust():
     print(f"{count} random windows: {bad} with a number that is not finite; statuses {status}")
 
 
-SBC_Q, SBC_R = (0.04, 0.25), (0.12, 0.75)
+#: Middle of the half-widths' prior in calibration, and its standard deviation over the middle, both of s^(1/2).
+MIDDLE, SPREAD = np.sqrt([0.1, 0.1, 0.1, 0.3, 0.3]), 0.25
 
 
-def from_the_prior(rng, power):
-    """Return half-widths (5,) from s^power in log s between their ends, by the inverse of its distribution."""
-    lo, hi = np.array([SBC_Q] * 3 + [SBC_R] * 2).T ** power
-    return (lo + rng.random(5) * (hi - lo)) ** (1.0 / power)
+def from_the_prior(rng):
+    """Return half-widths (5,) whose u = s^(1/2) has the density u^(2 power - 1) exp(-(u / middle - 1)^2 / 2 spread^2)."""
+    v = np.linspace(1e-4, 1.0 + 8 * SPREAD, 20_000)
+    below = np.cumsum(v ** (2 * posterior.POWER - 1) * np.exp(-0.5 * ((v - 1.0) / SPREAD) ** 2))
+    return (MIDDLE * np.interp(rng.random(5), below / below[-1], v)) ** 2
 
 
 def sbc(*, reference, delta=25, seed=5):
     """Return estimates, true states, and ranks of true half-widths (windows, 5) under the prior that they are drawn from.
 
-    `reference`: whether the estimates use the default prior, with its factor `told`, in place of the one drawn from.
+    It is a power of s, as the default prior is, times a Gaussian of s^(1/2), as other rows of a stream would tell it.
+    `reference`: whether the estimates have the default prior's factor `told` besides, which nothing can be drawn from.
     """
     rng = np.random.default_rng(seed)
     x0 = hw.Box(0.3 * BOX.lo, 0.3 * BOX.hi)
-    asked = system(hw.Uniform.unknown(*SBC_Q), hw.Uniform.unknown(*SBC_R), x0, bounds=None)
+    unknown = hw.Uniform.unknown(at_most=50.0)
+    asked = system(unknown, unknown, x0, bounds=None)
+    known = Known(1.0 / (MIDDLE * SPREAD**2), np.diag(1.0 / (MIDDLE * SPREAD) ** 2))
     kept = posterior._LIMITS["reference"]
     posterior._LIMITS["reference"] = kept if reference else 0.0
     ests, true, of_s = [], [], []
     for _ in range(WINDOWS):
-        s = from_the_prior(rng, posterior.POWER)
+        s = from_the_prior(rng)
         model = system(hw.Uniform(s[:3]), hw.Uniform(s[3:]), x0, bounds=None)
         truth, record = hw.simulate(model, rng.uniform(-1, 1, (delta + 1, 1)), seed=int(rng.integers(2**31)))
-        answer = hw.Posterior(nodes=256).answer(asked, record)
+        answer = hw.Posterior(nodes=256).answer(asked, record, known=known)
         K = int(answer.found["nodes"])
         weight = np.exp(answer.found["log_weight"][:K] - answer.found["log_weight"][:K].max())
         below = answer.found["phi"][:K] < np.log(s)

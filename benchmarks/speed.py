@@ -1,6 +1,6 @@
 """Speed beside the peers and beside a hand-written C++ loop.
 
-    python benchmarks/speed.py [kalman] [growth] [many] [stream] [nonlinear] [learn] [losses] [lp] [hull] [constrained] [sets] [mixed] [posterior]
+    python benchmarks/speed.py [kalman] [growth] [many] [stream] [nonlinear] [learn] [losses] [lp] [hull] [constrained] [sets] [mixed] [posterior] [vehicle]
 
 Without arguments everything runs. Outputs are compared before anything is timed. Times are CPU times of this process,
 the minimum of repeats, except where wall time is said; a ratio divides two times taken in turns in the same process. A
@@ -354,11 +354,12 @@ def part(module):
 PARTS = {one.__name__: (one,) for one in (growth, many, stream, learn)}
 PARTS |= {module: (part(module),) for module in ("nonlinear", "losses", "lp", "hull", "constrained", "sets", "mixed")}
 PARTS["posterior"] = (part("posterior_speed"),)
+PARTS["vehicle"] = (part("vehicle_speed"),)
 PARTS["kalman"] = (kalman, growth, many, stream, *PARTS["nonlinear"], learn)
 
 
 def main():
-    names = sys.argv[1:] or ["kalman", "losses", "lp", "constrained", "hull", "sets", "mixed", "posterior"]
+    names = sys.argv[1:] or ["kalman", "losses", "lp", "constrained", "hull", "sets", "mixed", "posterior", "vehicle"]
     unknown = [name for name in names if name not in PARTS]
     if unknown:
         sys.exit(f"no part {unknown}; there are {', '.join(PARTS)}")

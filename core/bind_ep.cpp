@@ -287,11 +287,21 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     a.damping = real("damping");
     nb::dict found;
     found["sites"] = p.sites(std::nullopt, 1);
+    const std::size_t columns = (nodes + abreast - 1) / abreast * abreast;
+    int since = 0;
+    bool sound = false;
+    l.finite = &sound;
+    l.since = &since;
+    l.again = whole("again");
+    l.columns = static_cast<int>(columns);
+    found["lanes"] = fresh({2 * (stages * n + rows), columns}, &l.lanes);
+    found["lane_phi"] = fresh({columns, q}, &l.lane_phi);
     hw::EpBefore old{};
     InInt old_start;
-    In old_sites[4];
+    In old_sites[8];
     if (before) {
-        want(before->size() == 5 && drop >= 0, "before: (start, m, D, tau, nu)");
+        want(before->size() == 12 && drop >= 0,
+             "before: (start, m, D, tau, nu, lanes, lane_phi, mode, H, log_mode, log_prior, since)");
         old_start = nb::cast<InInt>((*before)[0]);
         want(old_start.size() >= 2, "before: start");
         old.stages = static_cast<int>(old_start.size()) - 1;
@@ -303,6 +313,18 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
             old_sites[k] = nb::cast<In>((*before)[k + 1]);
             want(old_sites[k].size() == (k < 2 ? old.stages * n : std::size_t(old.start[old.stages])), "before: sites");
             *into[k] = old_sites[k].data();
+        }
+        for (int k = 4; k < 8; k++) old_sites[k] = nb::cast<In>((*before)[k + 1]);
+        const std::size_t old_columns = old_sites[4].size() / (2 * (old.stages * n + old.start[old.stages]));
+        if (old_columns == columns && old_sites[5].size() == columns * q && old_sites[6].size() == q &&
+            old_sites[7].size() == q * q && old_sites[4].size() == 2 * columns * (old.stages * n + old.start[old.stages])) {
+            old.lanes = old_sites[4].data();
+            old.lane_phi = old_sites[5].data();
+            old.mode = old_sites[6].data();
+            old.H = old_sites[7].data();
+            old.log_mode = nb::cast<double>((*before)[9]);
+            old.log_prior = nb::cast<double>((*before)[10]);
+            old.since = nb::cast<int>((*before)[11]);
         }
         l.before = &old;
     }
@@ -374,6 +396,8 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     }
     found["code"] = code;
     found["effective"] = effective;
+    found["since"] = since;
+    found["finite"] = sound;
     found["rate"] = nb::none();
     if (learn_eps) found["rate"] = found_rate;
     found["log_evidence"] = log_evidence;

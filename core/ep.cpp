@@ -56,7 +56,7 @@ void settle_in(Ep<N>& ep, EpFound& f, Place& place) {
 template <class N>
 int run(N n, const EpArgs& a) {
     for (int first = 0; first < a.members; first += wide_lanes) {
-        Ep<N> ep{n, a, {first, a.members - 1}, {}, {}};
+        Ep<N> ep{n, a, {first, a.members - 1}, {}, {}, 0};
         EpFound f{};
         Place place{reinterpret_cast<V*>(a.work)};
         settle_in(ep, f, place);
@@ -120,7 +120,7 @@ std::size_t learner_parameters(const EpLearnArgs& a) {
 
 template <class N>
 int learn(N n, const EpLearnArgs& a) {
-    Ep<N> ep{n, a.base, {0, wide_lanes - 1}, {}, {}};
+    Ep<N> ep{n, a.base, {0, wide_lanes - 1}, {}, {}, a.shaped};
     EpLearner<N> learner{ep, a};
     Place place{reinterpret_cast<V*>(a.base.work)};
     settle_in(ep, learner.f, place);
@@ -133,7 +133,7 @@ int learn(N n, const EpLearnArgs& a) {
     learner.lead = learner.keep_nu + a.base.rows;  // 2 * sites * parameters
     if (!a.outside) return learner.run();
     place.p += (2 * std::size_t(size + a.base.rows) * (1 + learner_parameters(a)) + wide_lanes - 1) / wide_lanes;
-    Ep<N> outside{n, *a.outside, {0, wide_lanes - 1}, {}, {}};
+    Ep<N> outside{n, *a.outside, {0, wide_lanes - 1}, {}, {}, 0};
     settle_in(outside, learner.fo, place);
     learner.outside = &outside;
     return learner.run();
@@ -203,11 +203,21 @@ int ep_learn(const EpLearnArgs& given) {
         a.pull = work;
         a.precision = work + p;
     }
-    a.base.warm = a.before && ep_moved(a);
-    if (a.base.warm) a.close = a.near;
+    EpBefore before{};
+    a.before = nullptr;
+    if (given.before) {
+        before = *given.before;
+        if (ep_shift(a.base, before)) a.before = &before;
+    }
+    a.base.warm = a.before != nullptr;
+    if (a.before) {
+        ep_moved(a);
+        a.close = a.near;
+    }
     const int code = learn_any(a);
     if (code >= 2) return code;
     const int q = static_cast<int>(learner_parameters(a));
+    *a.finite = ep_sound(a);
     ep_widths(a, q, rest);
     ep_told(a, q, rest);
     double own[ep_states] = {};

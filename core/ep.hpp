@@ -41,8 +41,9 @@ inline V root(const V& a) { return V::of(sqrt4(a.v)); }
 inline V log_of(const V& a) { return V::of(log4(a.v)); }
 inline V either(decltype(X{} < X{}) test, const V& a, const V& b) { return V::of(test ? a.v : b.v); }
 
+constexpr int shape_reach = 4;  // rows over which factors that are not Gaussian act together
+
 // sizes of local arrays
-constexpr int ep_reach = 4;  // rows over which factors that are not Gaussian act together
 template <class N>
 constexpr int ep_cap = N::fixed ? N::cap : ep_states;
 
@@ -159,15 +160,20 @@ struct EpCross {
 template <class N>
 struct Ep {
     static constexpr int cap = ep_cap<N>;
+    static constexpr int abreast = 3;  // sites of a stage that are renewed at a time
     N n;
     const EpArgs& a;
     EpBlock block;
     EpState s;
     EpCross cross;
+    int shaped = 0;  // first stage whose shape is asked for
     // A bound farther off than the root of `reach` standard deviations, or one that narrows its cavity's variance by a
     // share below `faint`, says nothing at the precision that is asked for.
     double reach = 72.0, faint = 1e-13;
+    bool mixed = false;  // rows with two explanations
 
+    // whether a shape that is asked for needs the cumulants of stage t
+    inline bool bent(int) const { return cross.S; }  // `second` asks for all
     inline int packed() const { return n * (n + 1) / 2; }
     inline void unpack(const V* p, V* M) const {
         for (int i = 0; i < n; i++)
@@ -227,23 +233,25 @@ struct Ep {
 
     void start() {
         for (int t = 0; t <= a.T; t++)
-            for (int i = 0; i < n; i++) {
-                const V w = has_site(t, i) ? width(t, i) : V(0.0);
-                s.m[t * n + i] = V(0.0);
-                s.D[t * n + i] = w * w * V(1.0 / 3.0);
-            }
-        for (int k = 0; k < a.rows; k++) {
-            s.nu[k] = V(0.0);
-            if (kind(k) == noise_gaussian) {
-                s.tau[k] = V(1.0) / variance(k);
-            } else if (kind(k) >= noise_contaminated) {  // bounds, and rows that may say nothing: not until they are asked
-                s.tau[k] = V(0.0);
-            } else {
-                const V w = a.group[k] >= 0 ? s.s[a.group[k]] : V(0.0);
-                s.tau[k] = V(1.0) / (w * w * V(1.0 / 3.0) + variance(k));
-            }
-        }
+            for (int i = 0; i < n; i++) start_noise(t, i);
+        for (int k = 0; k < a.rows; k++) start_row(k);
         forget();
+    }
+    void start_noise(int t, int i) {
+        const V w = has_site(t, i) ? width(t, i) : V(0.0);
+        s.m[t * n + i] = V(0.0);
+        s.D[t * n + i] = w * w * V(1.0 / 3.0);
+    }
+    void start_row(int k) {
+        s.nu[k] = V(0.0);
+        if (kind(k) == noise_gaussian) {
+            s.tau[k] = V(1.0) / variance(k);
+        } else if (kind(k) >= noise_contaminated) {  // bounds, and rows that may say nothing: not until they are asked
+            s.tau[k] = V(0.0);
+        } else {
+            const V w = a.group[k] >= 0 ? s.s[a.group[k]] : V(0.0);
+            s.tau[k] = V(1.0) / (w * w * V(1.0 / 3.0) + variance(k));
+        }
     }
 
     // Gaussian rows are their own sites, whatever they were taken from
@@ -315,6 +323,7 @@ struct Ep {
             }
         }
     }
+    inline bool single(int k) const { return kind(k) < noise_contaminated || kind(k) == ep_truncation; }
     // a bound that no lane has come near
     inline bool silent(int k) const { return kind(k) == ep_truncation && !any4(s.tau[k].v != X{}); }
     inline void row(int k, V* h) const {
@@ -337,48 +346,75 @@ struct Ep {
         f.residual = larger(f.residual, either(tv.v >= q.c * (1.0 - 1e-9), V(0.0), gap));
     }
 
+    // residual z, its variance v and covariance Ph with x_t, of row k in a belief
+    inline void project(int k, const V* h, const V* ms, const V* Ps, V* Ph, V* z, V* v) const {
+        *z = -target(k);
+        *v = V(0.0);
+        for (int i = 0; i < n; i++) {
+            V q(0.0);
+            for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
+            Ph[i] = q;
+            *v += h[i] * q;
+            *z += h[i] * ms[i];
+        }
+    }
+
     // renew (or, for the evidence, look at) the rows of stage t given the belief ms, Ps about x_t; fold each into the
-    // filtered mf, Pf
+    // filtered mf, Pf. Rows are renewed `abreast` at a time from one belief, so that their moments do not wait for each
+    // other, unless they have two explanations.
     template <bool renew>
     inline void rows(int t, V* ms, V* Ps, V* mf, V* Pf, EpFound& f, double damping) {
-        for (int k = a.start[t]; k < a.start[t + 1]; k++) {
-            V h[cap], Ph[cap];
-            row(k, h);
-            if constexpr (!renew) {
-                f.top += densest(k);
-                if (kind(k) == noise_gaussian) {
-                    f.log_z -= V(0.5) * (V(log_2pi) + log_of(variance(k)));
-                    if (a.group_R || a.mix) gaussian_slopes(k, h, ms, Ps, f);
-                    if (cross.S) cross.r3[k] = cross.r4[k] = V(0.0);
+        for (int first = a.start[t], last; first < a.start[t + 1]; first = last) {
+            last = first + 1;
+            while (single(first) && last < a.start[t + 1] && last - first < abreast && single(last)) last++;
+            V h[abreast][cap], dt[abreast] = {}, dn[abreast] = {};
+            bool says[abreast];
+            for (int k = first; k < last; k++) {
+                const int c = k - first;
+                row(k, h[c]);
+                says[c] = false;
+                if constexpr (!renew) {
+                    f.top += densest(k);
+                    if (kind(k) == noise_gaussian) {
+                        f.log_z -= V(0.5) * (V(log_2pi) + log_of(variance(k)));
+                        if (a.group_R || a.mix) gaussian_slopes(k, h[c], ms, Ps, f);
+                        if (bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
+                    }
                 }
-            }
-            if (kind(k) != noise_gaussian) {
-                V z = -target(k), v(0.0);
-                for (int i = 0; i < n; i++) {
-                    V q(0.0);
-                    for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
-                    Ph[i] = q;
-                    v += h[i] * q;
-                    z += h[i] * ms[i];
-                }
+                if (kind(k) == noise_gaussian) continue;
+                V Ph[cap], z, v;
+                project(k, h[c], ms, Ps, Ph, &z, &v);
                 if (silent(k) && far_inside(k, z, v)) {
-                    if (!renew && cross.S) cross.r3[k] = cross.r4[k] = V(0.0);
+                    if (!renew && bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
                     continue;
                 }
-                renew_row<renew>(k, z, v, Ph, ms, Ps, f, damping);
+                says[c] = true;
+                if constexpr (renew) propose(k, z, v, dt + c, dn + c, f, damping);
+                else look_at(t, k, z, v, f);
             }
-            fold<renew>(k, h, mf, Pf, f);
+            for (int k = first; k < last; k++) {
+                const int c = k - first;
+                if (renew && says[c]) {
+                    V Ph[cap], z, v;
+                    project(k, h[c], ms, Ps, Ph, &z, &v);
+                    const V gain = V(1.0) / larger(V(1.0) + dt[c] * v, V(1e-12));
+                    s.tau[k] += dt[c];
+                    s.nu[k] += dn[c];
+                    const V shift = (dn[c] - dt[c] * z) * gain, shrink = dt[c] * gain;
+                    for (int i = 0; i < n; i++) {
+                        ms[i] += Ph[i] * shift;
+                        const V g = Ph[i] * shrink;
+                        for (int j = 0; j < n; j++) Ps[i * n + j] -= g * Ph[j];
+                    }
+                }
+                if (says[c] || kind(k) == noise_gaussian) fold<renew>(k, h[c], mf, Pf, f);
+            }
         }
     }
     // d log Z / d log R = ((z^2 + v) / R - 1) / 2 of a Gaussian row whose residual has the posterior N(z, v)
     inline void gaussian_slopes(int k, const V* h, const V* ms, const V* Ps, EpFound& f) const {
-        V z = -target(k), v(0.0);
-        for (int i = 0; i < n; i++) {
-            V q(0.0);
-            for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
-            v += h[i] * q;
-            z += h[i] * ms[i];
-        }
+        V Ph[cap], z, v;
+        project(k, h, ms, Ps, Ph, &z, &v);
         Tilted<X> q{};
         const V R = variance(k);
         q.slope_R = (V(0.5) * ((z * z + v) / R - V(1.0))).v;
@@ -390,61 +426,51 @@ struct Ep {
         return !any4((up < X{}) | (down < X{}) | (up * up < least) | (down * down < least) | (v.v != v.v));
     }
 
-    template <bool renew>
-    inline void renew_row(int k, const V& z, V v, const V* Ph, V* ms, V* Ps, EpFound& f, double damping) {
-        // the cavity; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
+    // the cavity of row k; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
+    inline Cavity<X> cavity_of(int k, const V& z, const V& v) const {
         const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9)), over_open = V(1.0) / open;
-        v = larger(v, V(1e-300));
-        const V over_v = V(1.0) / v;
-        const V c = smaller(v * over_open, V(1e300)), mu = (z - v * s.nu[k]) * over_open, w = open * over_v;
-        const V scale = root(w);
-        const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};
-        if constexpr (renew) {
-            const Tilted<X> q = tilted<moments>(k, cavity);
-            const V tv = larger(of(q.var), V(1e-300)), tm = of(q.mean), over = V(1.0) / tv;
-            note(f, z, v, tm, tv, over, cavity);
-            // else the factor widens the belief: nothing for now
-            const auto says = tv.v < c.v * (1.0 - (kind(k) == ep_truncation ? faint : 1e-13));
-            const V tau = either(says, over - w, V(0.0)), nu = either(says, tm * over - mu * w, V(0.0));
-            // by what the site changes: a site that stays leaves the belief as it is, whatever rounding made of v
-            const V step(kind(k) >= noise_contaminated && kind(k) != ep_truncation ? damping : 1.0);
-            const V dt = step * (tau - s.tau[k]), dn = step * (nu - s.nu[k]);
-            const V gain = V(1.0) / larger(V(1.0) + dt * v, V(1e-12));
-            s.tau[k] += dt;
-            s.nu[k] += dn;
-            const V shift = (dn - dt * z) * gain, shrink = dt * gain;
-            for (int i = 0; i < n; i++) {
-                ms[i] += Ph[i] * shift;
-                const V g = Ph[i] * shrink;
-                for (int j = 0; j < n; j++) Ps[i * n + j] -= g * Ph[j];
-            }
-        } else {
-            const Tilted<X> q = cross.S ? tilted<cumulants>(k, cavity) : tilted<evidence>(k, cavity);
-            const V tv = larger(of(q.var), V(1e-300));
-            note(f, z, v, of(q.mean), tv, V(1.0) / tv, cavity);
-            f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], mu, c);
-            f.worst = smaller(f.worst, of(q.log_z) + unit(k));
-            slopes(k, q, v, f);
-            if (cross.S) ratios(q, v, cross.r3 + k, cross.r4 + k);
-            if (a.out) {
-                for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++)
-                    a.out[static_cast<std::ptrdiff_t>(block.first + l) * a.rows + k] = q.out[l];
-            }
+        const V c = smaller(v * over_open, V(1e300)), mu = (z - v * s.nu[k]) * over_open, scale = root(open / v);
+        return {mu.v, c.v, (c * scale).v, scale.v};
+    }
+
+    // the change of row k's site that reproduces its moments
+    inline void propose(int k, const V& z, const V& spread, V* dt, V* dn, EpFound& f, double damping) const {
+        const V v = larger(spread, V(1e-300));
+        const Cavity<X> cavity = cavity_of(k, z, v);
+        const V scale = of(cavity.scale), w = scale * scale;
+        const Tilted<X> q = tilted<moments>(k, cavity);
+        const V tv = larger(of(q.var), V(1e-300)), tm = of(q.mean), over = V(1.0) / tv;
+        note(f, z, v, tm, tv, over, cavity);
+        // else the factor widens the belief: nothing for now
+        const auto says = tv.v < cavity.c * (1.0 - (kind(k) == ep_truncation ? faint : 1e-13));
+        const V tau = either(says, over - w, V(0.0)), nu = either(says, tm * over - of(cavity.mu) * w, V(0.0));
+        // by what the site changes: a site that stays leaves the belief as it is, whatever rounding made of v
+        const V step(single(k) ? 1.0 : damping);
+        *dt = step * (tau - s.tau[k]);
+        *dn = step * (nu - s.nu[k]);
+    }
+
+    inline void look_at(int t, int k, const V& z, const V& spread, EpFound& f) {
+        const V v = larger(spread, V(1e-300));
+        const Cavity<X> cavity = cavity_of(k, z, v);
+        const Tilted<X> q = bent(t) ? tilted<cumulants>(k, cavity) : tilted<evidence>(k, cavity);
+        const V tv = larger(of(q.var), V(1e-300));
+        note(f, z, v, of(q.mean), tv, V(1.0) / tv, cavity);
+        f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], of(cavity.mu), of(cavity.c));
+        f.worst = smaller(f.worst, of(q.log_z) + unit(k));
+        slopes(k, q, v, f);
+        if (bent(t)) ratios(q, v, cross.r3 + k, cross.r4 + k);
+        if (a.out) {
+            for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++)
+                a.out[static_cast<std::ptrdiff_t>(block.first + l) * a.rows + k] = q.out[l];
         }
     }
 
     // site of row k into the filtered moments mf, Pf
     template <bool renew>
     inline void fold(int k, const V* h, V* mf, V* Pf, EpFound& f) {
-        V Ph[cap];
-        V z = -target(k), v(0.0);
-        for (int i = 0; i < n; i++) {
-            V q(0.0);
-            for (int j = 0; j < n; j++) q += Pf[i * n + j] * h[j];
-            Ph[i] = q;
-            v += h[i] * q;
-            z += h[i] * mf[i];
-        }
+        V Ph[cap], z, v;
+        project(k, h, mf, Pf, Ph, &z, &v);
         const V tau = s.tau[k], gain = V(1.0) / (V(1.0) + tau * v);
         if constexpr (!renew) f.log_z += integral(tau, s.nu[k], z, v);
         const V shift = (s.nu[k] - tau * z) * gain, shrink = tau * gain;
@@ -494,35 +520,80 @@ struct Ep {
         f.slope[a.groups] += of(q.slope_eps);
     }
 
-    // ---- the two halves of a sweep -------------------------------------------------------------------------------
+    // mp, Pp of stage t >= 1 from the filtered mf, Pf of the one before
+    inline void predict(int t, const V* A, const V* G, const V* mf, const V* Pf, V* mp, V* Pp) const {
+        V AP[cap * cap];
+        noise(t, G, Pp, mp);
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < n; j++) {
+                V q(0.0);
+                for (int k = 0; k < n; k++) q += A[i * n + k] * Pf[k * n + j];
+                AP[i * n + j] = q;
+                mp[i] += A[i * n + j] * mf[j];
+            }
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j <= i; j++) {
+                V q = Pp[i * n + j];
+                for (int k = 0; k < n; k++) q += AP[i * n + k] * A[j * n + k];
+                Pp[i * n + j] = Pp[j * n + i] = q;
+            }
+    }
 
-    template <bool renew>
-    void forward(EpFound& f, double damping) {
-        V A[cap * cap], G[cap * cap], mf[cap], Pf[cap * cap];
-        if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
-        if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
+    // the predicted moments of the sites as they are
+    void filter() {
+        V A[cap * cap], G[cap * cap] = {}, mf[cap] = {}, Pf[cap * cap] = {};
+        EpFound none{};
         for (int t = 0; t <= a.T; t++) {
             V mp[cap], Pp[cap * cap];
             if (t == 0) {
                 prior(mp, Pp);
             } else {
-                V AP[cap * cap];
+                block.loads(a.A, t - 1, n * n, A);
+                if (a.G.data) block.loads(a.G, t - 1, n * n, G);
+                predict(t, A, G, mf, Pf, mp, Pp);
+            }
+            for (int i = 0; i < n; i++) s.mp[t * n + i] = mf[i] = mp[i];
+            pack(Pp, s.Pp + t * packed());
+            for (int i = 0; i < n * n; i++) Pf[i] = Pp[i];
+            for (int k = a.start[t]; k < a.start[t + 1]; k++) {
+                if (silent(k)) continue;
+                V h[cap];
+                row(k, h);
+                fold<true>(k, h, mf, Pf, none);
+            }
+        }
+    }
+
+    // ---- the two halves of a sweep -------------------------------------------------------------------------------
+
+    // Whether every lane that is alive has agreed within `quiet` in a stage, after `before` in those gone over so far.
+    bool still(EpFound& f, const V& before, double quiet) const {
+        bool calm = quiet > 0.0;
+        for (int l = 0; l < wide_lanes; l++)
+            if (alive(f, l) && !(f.residual[l] < quiet * quiet)) calm = false;
+        f.residual = larger(before, f.residual);
+        return calm;
+    }
+
+    // From stage `from` on, whose predicted moments are known where it is not the first, to the second of two in a row that
+    // are still; returns it.
+    template <bool renew>
+    int forward(EpFound& f, double damping, int from = 0, double quiet = 0.0) {
+        int calm = 0;
+        V A[cap * cap], G[cap * cap], mf[cap] = {}, Pf[cap * cap] = {};
+        if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
+        if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
+        for (int t = from; t <= a.T; t++) {
+            V mp[cap], Pp[cap * cap];
+            if (t == 0) {
+                prior(mp, Pp);
+            } else if (t == from) {
+                for (int i = 0; i < n; i++) mp[i] = s.mp[t * n + i];
+                unpack(s.Pp + t * packed(), Pp);
+            } else {
                 if (a.A.count != 1) block.loads(a.A, t - 1, n * n, A);
                 if (a.G.data && a.G.count != 1) block.loads(a.G, t - 1, n * n, G);
-                noise(t, G, Pp, mp);
-                for (int i = 0; i < n; i++)
-                    for (int j = 0; j < n; j++) {
-                        V q(0.0);
-                        for (int k = 0; k < n; k++) q += A[i * n + k] * Pf[k * n + j];
-                        AP[i * n + j] = q;
-                        mp[i] += A[i * n + j] * mf[j];
-                    }
-                for (int i = 0; i < n; i++)
-                    for (int j = 0; j <= i; j++) {
-                        V q = Pp[i * n + j];
-                        for (int k = 0; k < n; k++) q += AP[i * n + k] * A[j * n + k];
-                        Pp[i * n + j] = Pp[j * n + i] = q;
-                    }
+                predict(t, A, G, mf, Pf, mp, Pp);
             }
             for (int i = 0; i < n; i++) s.mp[t * n + i] = mp[i];
             pack(Pp, s.Pp + t * packed());
@@ -543,19 +614,28 @@ struct Ep {
                     give(t, ms, Ps);
                     for (int i = 0; i < n * n; i++) cross.S[t * n * n + i] = Ps[i];
                 }
+                const V before = f.residual;
+                if (renew) f.residual = V(0.0);
                 rows<renew>(t, ms, Ps, mf, Pf, f, damping);
+                if (renew) {
+                    calm = still(f, before, quiet) ? calm + 1 : 0;
+                    if (calm == 2) return t;
+                }
             }
-            if (!renew && cross.S)
+            if (!renew && bent(t + 1))
                 for (int i = 0; i < n * n; i++) cross.Pf[t * n * n + i] = Pf[i];
         }
+        return a.T;
     }
 
+    // From stage `from` back to the second of two in a row that are still; returns it.
     template <bool renew>
-    void backward(EpFound& f) {
+    int backward(EpFound& f, int from, double quiet = 0.0) {
+        int calm = 0;
         V A[cap * cap], G[cap * cap];
         if (a.A.count == 1 && a.T > 0) block.loads(a.A, 0, n * n, A);
         if (a.G.data && a.G.count == 1 && a.T > 0) block.loads(a.G, 0, n * n, G);
-        for (int t = a.T; t >= 0; t--) {
+        for (int t = from; t >= 0; t--) {
             V Lambda[cap * cap], eta[cap], Pp[cap * cap], U[cap * cap], W[cap * cap], r[cap], gap[cap];
             if (t > 0) {
                 if (a.A.count != 1) block.loads(a.A, t - 1, n * n, A);
@@ -570,11 +650,18 @@ struct Ep {
                 for (int j = 0; j < n; j++) gap[i] -= Lambda[i * n + j] * s.mp[t * n + j];
             }
             less(W, Pp, gap, r);
-            if (!renew && cross.S) covariances(t, A, G, W, Pp);
+            if (!renew && bent(t)) covariances(t, A, G, W, Pp);
             if (t > 0 && a.G.data) turn(G, W, r);
+            const V before = f.residual;
+            if (renew) f.residual = V(0.0);
             sites<renew>(t, W, r, f);
             if (t > 0) pass_on(t, A, G, Lambda, eta, U);
+            if (renew) {
+                calm = still(f, before, quiet) ? calm + 1 : 0;
+                if (calm == 2) return t;
+            }
         }
+        return 0;
     }
 
     // Lambda, eta of t and the root U of Lambda become the message to t - 1
@@ -604,12 +691,15 @@ struct Ep {
         }
     }
 
+    inline void nothing_after() {
+        for (int i = 0; i < n; i++) s.eb[a.T * n + i] = V(0.0);
+        for (int i = 0; i < packed(); i++) s.Lb[a.T * packed() + i] = V(0.0);
+    }
     // the future's messages of the sites as they are
     void hear() {
         fix();
         V A[cap * cap], G[cap * cap] = {}, Lambda[cap * cap], eta[cap], U[cap * cap];
-        for (int i = 0; i < n; i++) s.eb[a.T * n + i] = V(0.0);
-        for (int i = 0; i < packed(); i++) s.Lb[a.T * packed() + i] = V(0.0);
+        nothing_after();
         for (int t = a.T; t > 0; t--) {
             block.loads(a.A, t - 1, n * n, A);
             if (a.G.data) block.loads(a.G, t - 1, n * n, G);
@@ -674,14 +764,14 @@ struct Ep {
     }
 
     // What log Z lacks, to second order in what the sites leave out (Opper, Paquet and Winther 2013): every two factors
-    // with tilted cumulants k_r add k_r k_r' (Cov(z, z') / (Var(z) Var(z')))^r / r!, r = 3 and 4, up to `ep_reach` rows apart.
+    // with tilted cumulants k_r add k_r k_r' (Cov(z, z') / (Var(z) Var(z')))^r / r!, r = 3 and 4, up to `shape_reach` rows apart.
     // Rows with two explanations are left out: theirs is no small correction.
     V second() const {
-        V total(0.0), R[ep_reach][cap * cap], C[ep_reach][cap * cap];
+        V total(0.0), R[shape_reach][cap * cap], C[shape_reach][cap * cap];
         for (int t = 0; t <= a.T; t++) {
             V M[cap * cap], W[cap * cap], h[cap];
             int last = 0;
-            for (int l = 1; l <= ep_reach && t + l <= a.T; l++) {
+            for (int l = 1; l <= shape_reach && t + l <= a.T; l++) {
                 const int u = t + l;
                 if (l > 1) gain(R[l - 2], u - 1, M);
                 else
@@ -750,10 +840,10 @@ struct Ep {
     }
 
     // Third and fourth cumulants of the states, to first order in what the sites leave out: a factor whose tilted
-    // distribution has the cumulant k_r adds (Cov(x, z) / Var(z))^r k_r. Factors more than `ep_reach` rows away count as
-    // Gaussian: they add with the r-th power of a small correlation. Of the stages from `first` on.
-    void shapes(double* k3, double* k4, int first = 0) const {
-        for (int t = first; t <= a.T; t++) {
+    // distribution has the cumulant k_r adds (Cov(x, z) / Var(z))^r k_r. Factors more than `shape_reach` rows away count as
+    // Gaussian: they add with the r-th power of a small correlation. Of the stages from `shaped` on.
+    void shapes(double* k3, double* k4) const {
+        for (int t = shaped; t <= a.T; t++) {
             V c3[cap], c4[cap], R[cap * cap], M[cap * cap];
             for (int i = 0; i < n; i++) c3[i] = c4[i] = V(0.0);
             const V* S = cross.S + t * n * n;
@@ -764,7 +854,7 @@ struct Ep {
                     R[i] = S[i];
                     M[i] = V(i % (n + 1) == 0 ? 1.0 : 0.0);
                 }
-                for (int l = 1; l <= ep_reach; l++) {
+                for (int l = 1; l <= shape_reach; l++) {
                     const int u = side == 0 ? t + l : t - l;
                     if (u < 0 || u > a.T) break;
                     if (l > 1) gain(R, side == 0 ? u - 1 : u + 1, M);  // Cov(x_t, x_v) Cov(x_v)^-1, v next to u
@@ -891,35 +981,58 @@ struct Ep {
         for (int i = 0; i < n; i++) r[i] = g[i];
     }
 
+    // renew (or look at) the sites of w_t given W, r; `abreast` at a time, as the rows
     template <bool renew>
     inline void sites(int t, V* W, V* r, EpFound& f) {
         V *m = s.m + t * n, *D = s.D + t * n;
-        for (int i = 0; i < n; i++) {
-            if constexpr (!renew)
-                if (t > 0 && fitted(i)) {  // g_i has the posterior mean p r_i and variance p - p W_ii p
-                    const V p = power(i), share = p * W[i * n + i];
-                    f.slope[a.group_Q[i]] += p * r[i] * r[i] - share;
-                    f.learned[a.group_Q[i]] += share * share;
+        for (int first = 0; first < n; first += abreast) {
+            const int last = first + abreast < n ? first + abreast : int(n);
+            V dD[abreast] = {}, dm[abreast] = {};
+            for (int i = first; i < last; i++) {
+                if constexpr (!renew)
+                    if (t > 0 && fitted(i)) {  // g_i has the posterior mean p r_i and variance p - p W_ii p
+                        const V p = power(i), share = p * W[i * n + i];
+                        f.slope[a.group_Q[i]] += p * r[i] * r[i] - share;
+                        f.learned[a.group_Q[i]] += share * share;
+                    }
+                if (!has_site(t, i)) {
+                    if (!renew && bent(t)) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
+                    continue;
                 }
-            if (!has_site(t, i)) {
-                if (!renew && cross.S) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
-                continue;
+                const V half = larger(width(t, i), V(1e-150)), square = half * half;
+                V know = W[i * n + i];
+                if (any4(know.v * square.v < all<X>(1e-8))) know = larger(know, V(1e-8) / square);  // nothing known: a wide cavity
+                const V over_know = V(1.0) / know, told = D[i] * know, open = larger(V(1.0) - told, V(1e-12) * told);
+                const V c = open * over_know, mu = m[i] + r[i] * over_know, w = know / open, scale = root(w);
+                const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};
+                const V mean = m[i] + D[i] * r[i], var = D[i] * (V(1.0) - told);
+                if constexpr (renew) {
+                    const Tilted<X> q = uniform4<moments>(cavity, half.v);
+                    const V tv = of(q.var), tm = of(q.mean);
+                    note(f, mean, var, tm, larger(tv, V(1e-300)), V(1.0) / larger(tv, V(1e-300)), cavity);
+                    const V rest = larger(V(1.0) - tv * w, V(1e-6));  // 1 - tilted variance over the cavity's
+                    const V over = V(1.0) / rest;
+                    dD[i - first] = tv * over - D[i];
+                    dm[i - first] = mu + (tm - mu) * over - m[i];
+                } else {
+                    const Tilted<X> q = bent(t) ? uniform4<cumulants>(cavity, half.v) : uniform4<evidence>(cavity, half.v);
+                    const V tv = larger(of(q.var), V(1e-300));
+                    note(f, mean, var, of(q.mean), tv, V(1.0) / tv, cavity);
+                    const V spread = D[i] + c, d = m[i] - mu;
+                    f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + log_of(spread) + d * d / spread);
+                    f.worst = smaller(f.worst, of(q.log_z) + log_of(V(2.0) * half));
+                    if (t > 0) {
+                        const V share = larger(V(1.0) - V(3.0) * var / square, V(0.0));
+                        f.slope[a.group_w[i]] += of(q.slope_s);
+                        f.learned[a.group_w[i]] += share * share;
+                    }
+                    if (bent(t)) ratios(q, var, cross.w3 + t * n + i, cross.w4 + t * n + i);
+                }
             }
-            const V half = larger(width(t, i), V(1e-150)), square = half * half;
-            V know = W[i * n + i];
-            if (any4(know.v * square.v < all<X>(1e-8))) know = larger(know, V(1e-8) / square);  // nothing known: a wide cavity
-            const V over_know = V(1.0) / know, told = D[i] * know, open = larger(V(1.0) - told, V(1e-12) * told);
-            const V c = open * over_know, mu = m[i] + r[i] * over_know, w = know / open, scale = root(w);
-            const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};
-            const V mean = m[i] + D[i] * r[i], var = D[i] * (V(1.0) - told);
-            if constexpr (renew) {
-                const Tilted<X> q = uniform4<moments>(cavity, half.v);
-                const V tv = of(q.var), tm = of(q.mean);
-                note(f, mean, var, tm, larger(tv, V(1e-300)), V(1.0) / larger(tv, V(1e-300)), cavity);
-                const V rest = larger(V(1.0) - tv * w, V(1e-6));  // 1 - tilted variance over the cavity's
-                const V over = V(1.0) / rest, dD = tv * over - D[i], dm = mu + (tm - mu) * over - m[i];
-                const V gain = V(1.0) / larger(V(1.0) + dD * W[i * n + i], V(1e-12));
-                const V shift = (r[i] * dD + dm) * gain, shrink = dD * gain;
+            for (int i = first; renew && i < last; i++) {
+                if (!has_site(t, i)) continue;
+                const V gain = V(1.0) / larger(V(1.0) + dD[i - first] * W[i * n + i], V(1e-12));
+                const V shift = (r[i] * dD[i - first] + dm[i - first]) * gain, shrink = dD[i - first] * gain;
                 V column[cap];
                 for (int j = 0; j < n; j++) column[j] = W[j * n + i];
                 for (int j = 0; j < n; j++) {
@@ -927,21 +1040,8 @@ struct Ep {
                     const V g = column[j] * shrink;
                     for (int k = 0; k < n; k++) W[j * n + k] -= g * column[k];
                 }
-                D[i] += dD;
-                m[i] += dm;
-            } else {
-                const Tilted<X> q = cross.S ? uniform4<cumulants>(cavity, half.v) : uniform4<evidence>(cavity, half.v);
-                const V tv = larger(of(q.var), V(1e-300));
-                note(f, mean, var, of(q.mean), tv, V(1.0) / tv, cavity);
-                const V spread = D[i] + c, d = m[i] - mu;
-                f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + log_of(spread) + d * d / spread);
-                f.worst = smaller(f.worst, of(q.log_z) + log_of(V(2.0) * half));
-                if (t > 0) {
-                    const V share = larger(V(1.0) - V(3.0) * var / square, V(0.0));
-                    f.slope[a.group_w[i]] += of(q.slope_s);
-                    f.learned[a.group_w[i]] += share * share;
-                }
-                if (cross.S) ratios(q, var, cross.w3 + t * n + i, cross.w4 + t * n + i);
+                D[i] += dD[i - first];
+                m[i] += dm[i - first];
             }
         }
     }
@@ -971,7 +1071,7 @@ struct Ep {
     void sweep(EpFound& f, double damping) {
         clear(f);
         forward<true>(f, damping);
-        backward<true>(f);
+        backward<true>(f, a.T);
         f.residual = root(f.residual);
     }
 
@@ -979,16 +1079,73 @@ struct Ep {
     // numbers are no longer finite or a factor lies thousands of standard deviations from where the others put it: no
     // trajectory fits, and its sites run away.
     int settle(EpFound& f, int sweeps, double tol, double damping) {
-        reach = min2(max2(2.0 * std::log(1e3 / max2(tol, 1e-300)), 20.0), 72.0);
-        faint = min2(max2(2e-3 * tol, 1e-13), 1e-4);
+        fineness(tol);
+        V before(1e300);
         for (int k = 1; k <= sweeps; k++) {
             sweep(f, damping);
-            bool done = true;
-            for (int l = 0; l < wide_lanes; l++)
-                if (alive(f, l) && !(f.residual[l] < tol)) done = false;
-            if (done) return k;
+            if (settled(f, before, tol)) return k;
+            before = f.residual;
         }
         return sweeps;
+    }
+    // The same from sites that fit but for those near either end of the chain: each sweep goes as far as it changes
+    // anything. Returns the stages gone over.
+    int settle_ends(EpFound& f, int sweeps, double tol, double damping) {
+        fineness(tol);
+        fix();
+        filter();
+        nothing_after();
+        const double quiet = 0.3 * tol;
+        V before(1e300);
+        int stages = 0;
+        for (int k = 1; k <= sweeps; k++) {
+            clear(f);
+            const int from = backward<true>(f, a.T, quiet);
+            forward<true>(f, damping, from);
+            f.residual = root(f.residual);
+            stages += a.T + 1 - from;
+            if (settled(f, before, tol)) break;
+            before = f.residual;
+        }
+        hear();
+        before = V(1e300);
+        for (int k = 1; k <= sweeps; k++) {
+            clear(f);
+            const int to = forward<true>(f, damping, 0, quiet);
+            backward<true>(f, to);
+            f.residual = root(f.residual);
+            stages += to + 1;
+            if (settled(f, before, tol)) break;
+            before = f.residual;
+        }
+        return stages;
+    }
+    void fineness(double tol) {
+        mixed = false;
+        for (int k = 0; k < a.rows; k++) mixed = mixed || !single(k);
+        reach = min2(max2(2.0 * std::log(1e3 / max2(tol, 1e-300)), 20.0), 72.0);
+        faint = min2(max2(2e-3 * tol, 1e-13), 1e-4);
+    }
+    // What a sweep finds it then mends: what is left is expected to fall at the rate seen, at best to a quarter. Rows with
+    // two explanations keep no rate.
+    bool settled(const EpFound& f, const V& before, double tol) const {
+        if (mixed) return within(f, f.residual, tol);
+        V left = f.residual;
+        for (int l = 0; l < wide_lanes; l++)
+            if (before[l] < 1e300) left.set(l, left[l] * min2(max2(left[l] / before[l], 0.25), 1.0));
+        return within(f, left, 0.7 * tol);
+    }
+    // whether `left` is below tol on average over the lanes that are alive, and not far above in any
+    bool within(const EpFound& f, const V& left, double tol) const {
+        double sum = 0.0;
+        int count = 0;
+        for (int l = 0; l < wide_lanes; l++) {
+            if (!alive(f, l)) continue;
+            if (!(left[l] < (mixed ? 1.0 : 3.0) * tol)) return false;
+            sum += left[l];
+            count++;
+        }
+        return sum <= count * tol;
     }
     static inline bool alive(const EpFound& f, int l) { return finite(f.residual[l]) && f.far[l] < 1e8; }
 
@@ -996,7 +1153,7 @@ struct Ep {
     void look(EpFound& f) {
         clear(f);
         forward<false>(f, 1.0);
-        backward<false>(f);
+        backward<false>(f, a.T);
         f.residual = root(f.residual);
     }
     static inline bool sound(const EpFound& f, int l) {

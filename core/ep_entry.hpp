@@ -61,11 +61,17 @@ struct EpArgs {
     double* work;                  // ep_workspace doubles, on a 32-byte boundary
 };
 
-// Sites of the window before; see core/ep_handover.hpp.
+// Sites of the window before, of its mode and of every lane that was evaluated; see core/ep_handover.hpp.
 struct EpBefore {
     int stages, drop;                 // of it; how many rows later the new one begins
     const std::int32_t* start;        // (stages+1,)
     const double *m, *D, *tau, *nu;   // (stages,n), (start[stages],)
+    const double *lanes, *lane_phi;   // as those of EpLearnArgs, of as many columns; or null. With them:
+    const double *mode, *H;           // (q,), (q,q)
+    double log_mode, log_prior;
+    int since;                        // windows since the mode was searched for
+    // rows that both hold: found by `ep_shift`
+    int common, low, high, there;     // stages but the first; rows here, and the first of them there
 };
 
 // Half-widths and the rate of outliers found by evidence; see core/ep_learn.hpp. `base` has a member for each node, up to a
@@ -78,6 +84,7 @@ struct EpLearnArgs {
     const double *floor, *cap, *scale;       // (groups,): bounds, and the order of size
     const double* start;                     // (groups,): first guess, and the half-widths that `before` belongs to
     const EpBefore* before;                  // sites to start from; or null
+    int again;                               // windows that may take over the mode of the one before, one after the other
     int shaped;                              // first stage whose skewness and kurtosis are asked for
     const double* count;                     // (groups,): rows of each
     bool learn_eps;
@@ -102,6 +109,10 @@ struct EpLearnArgs {
     double *mean, *sd, *quantile_lo, *quantile_hi;           // (groups,), only the free ones written: half-widths, variances
     double *found_rate, *effective;                          // rate of outliers; effective number of nodes
     double *told_pull, *told_precision;                      // (groups,), (groups,groups): what the rows tell
+    int columns;                                             // nodes in whole registers
+    double *lanes, *lane_phi;  // (2 sites, columns): m and nu, then D and tau, of each; (columns, q) its parameters, or NaN
+    bool* finite;                                            // whether x and P are
+    int* since;                                              // windows since the mode was searched for
     double *edge_x, *edge_P;                                 // (T+1,n), (T+1,n,n): x_t given what lies up to t
 };
 

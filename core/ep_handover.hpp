@@ -275,6 +275,19 @@ inline void ep_told(const EpLearnArgs& a, int q, double* work) {
     }
 }
 
+// Whether the moments of the states are numbers; a shape that is none is that of a Gaussian.
+inline bool ep_sound(const EpLearnArgs& a) {
+    const std::ptrdiff_t size = std::ptrdiff_t(a.base.T + 1) * a.base.n;
+    bool sound = true;
+    for (std::ptrdiff_t k = 0; k < size; k++) {
+        sound = sound && finite(a.x[k]);
+        if (!finite(a.k3[k])) a.k3[k] = 0.0;
+        if (!finite(a.k4[k])) a.k4[k] = 0.0;
+    }
+    for (std::ptrdiff_t k = 0; k < size * a.base.n; k++) sound = sound && finite(a.P[k]);
+    return sound;
+}
+
 // Mean (T+1,n) and covariance (T+1,n,n) of x_t given what lies up to t, by the sites m, D, tau, nu of member 0; own (n,):
 // variances of what w has besides. work (4 n^2 + 2 n)
 inline void ep_edge(const EpArgs& a, const double* own, const double* m, const double* D, const double* tau, const double* nu, double* found_x,
@@ -335,39 +348,42 @@ inline void ep_edge(const EpArgs& a, const double* own, const double* m, const d
     }
 }
 
-// Sites of a window that begins `drop` rows after the one they are from: its new ones are the Gaussians of their
-// variances. Written to the base's m, D, tau, nu; false where the two do not hold the same rows in common.
-inline bool ep_moved(const EpLearnArgs& a) {
+// Which rows two windows share; false where they do not hold the same ones.
+inline bool ep_shift(const EpArgs& b, EpBefore& w) {
+    w.common = w.stages - 1 - w.drop;
+    const bool first = w.drop == 0;  // the state before the first row is the same
+    if ((w.common < 1 && !first) || w.common > b.T) return false;
+    w.low = b.start[first ? 0 : 1];
+    w.high = b.start[w.common + 1];
+    w.there = w.start[first ? 0 : w.drop + 1];
+    return w.high - w.low == w.start[w.stages] - w.there;
+}
+// place in the window before of w_ti, and of a row; -1: none
+inline std::ptrdiff_t ep_origin(const EpBefore& w, int n, int t, int i) {
+    return t > w.common || (t == 0 && w.drop > 0) ? -1 : std::ptrdiff_t(t + w.drop) * n + i;
+}
+inline std::ptrdiff_t ep_origin(const EpBefore& w, int k) { return k < w.low || k >= w.high ? -1 : w.there + k - w.low; }
+
+// Sites of the mode of a window that begins `drop` rows after the one they are from, to the base's m, D, tau, nu: its new
+// ones are the Gaussians of their variances.
+inline void ep_moved(const EpLearnArgs& a) {
     const EpBefore& w = *a.before;
     const EpArgs& b = a.base;
-    const int n = b.n, stages = b.T + 1, common = w.stages - 1 - w.drop;
-    const bool first = w.drop == 0;  // the state before the first row is the same
-    if ((common < 1 && !first) || common + 1 > stages) return false;
-    const int low = b.start[first ? 0 : 1], high = b.start[common + 1], there = w.start[first ? 0 : w.drop + 1];
-    if (high - low != w.start[w.stages] - there) return false;
-    for (int i = 0; i < n; i++) {
-        b.m[i] = first ? w.m[i] : 0.0;
-        b.D[i] = first ? w.D[i] : b.half0[i] * b.half0[i] / 3.0;
-    }
-    for (int t = 1; t < stages; t++)
-        for (int i = 0; i < n; i++) {
-            const std::ptrdiff_t to = std::ptrdiff_t(t) * n + i, from = to + std::ptrdiff_t(w.drop) * n;
-            const double s = b.group_w[i] >= 0 ? a.start[b.group_w[i]] : 0.0;
-            b.m[to] = t <= common ? w.m[from] : 0.0;
-            b.D[to] = t <= common ? w.D[from] : s * s / 3.0;
+    for (int t = 0; t <= b.T; t++)
+        for (int i = 0; i < b.n; i++) {
+            const std::ptrdiff_t to = std::ptrdiff_t(t) * b.n + i, from = ep_origin(w, b.n, t, i);
+            const double s = t == 0 ? b.half0[i] : b.group_w[i] >= 0 ? a.start[b.group_w[i]] : 0.0;
+            b.m[to] = from < 0 ? 0.0 : w.m[from];
+            b.D[to] = from < 0 ? s * s / 3.0 : w.D[from];
         }
     for (int k = 0; k < b.rows; k++) {
-        if (k >= low && k < high) {
-            b.tau[k] = w.tau[there + k - low];
-            b.nu[k] = w.nu[there + k - low];
-        } else {
-            const double s = b.group[k] >= 0 ? a.start[b.group[k]] : 0.0;
-            const double r = b.group_R && b.group_R[k] >= 0 ? a.start[b.group_R[k]] : 0.0;
-            b.tau[k] = b.kind[k] < noise_contaminated ? 1.0 / max2(s * s / 3.0 + r * r + b.R[k], 1e-300) : 0.0;
-            b.nu[k] = 0.0;
-        }
+        const std::ptrdiff_t from = ep_origin(w, k);
+        const double s = b.group[k] >= 0 ? a.start[b.group[k]] : 0.0;
+        const double r = b.group_R && b.group_R[k] >= 0 ? a.start[b.group_R[k]] : 0.0;
+        const double first = b.kind[k] < noise_contaminated ? 1.0 / max2(s * s / 3.0 + r * r + b.R[k], 1e-300) : 0.0;
+        b.tau[k] = from < 0 ? first : w.tau[from];
+        b.nu[k] = from < 0 ? 0.0 : w.nu[from];
     }
-    return true;
 }
 
 }  // namespace HW_ISA

@@ -20,6 +20,7 @@
 #pragma once
 
 #include "ep.hpp"
+#include "ep_handover.hpp"
 
 namespace hw {
 namespace HW_ISA {
@@ -29,6 +30,7 @@ constexpr int ep_stages = 8;  // most stages of points
 constexpr double ep_lean = 4.0;  // points that a first guess of their covariance is worth
 constexpr double ep_wide = 1.15;  // by how much a stage reaches farther than the posterior is thought to
 constexpr double ep_some = 10.0;  // effective points without which the evidence itself is in doubt
+constexpr int ep_few = 2;     // rows that may come or go while the mode stays
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
 template <class N>
@@ -223,14 +225,90 @@ struct EpLearner {
                 ep.s.nu[k] = ep.s.tau[k] * mean;
             }
         }
-        ep.hear();
+    }
+
+    // ---- lanes go on where those of the window before were ---------------------------------------------------------
+
+    // how the sites of an evaluation begin: afresh, where they were left, or so but for rows that have come and gone
+    enum Begin { afresh, led, resumed };
+
+    static inline V load(const double* p) {
+        V v;
+        __builtin_memcpy(&v, p, sizeof v);
+        return v;
+    }
+    // The lanes' sites are those of `column` and the next ones in the window before, led along from their parameters to
+    // phi; those of the mode where there are none near. Returns whether they are of any use.
+    bool resume(int column, const double (*phi)[ep_free]) {
+        if (!a.base.warm || !a.before->lanes) return false;
+        V d[ep_free], near(1.0);
+        int lost = 0;
+        for (int l = 0; l < wide_lanes; l++) {
+            bool close = true;
+            for (int j = 0; j < q; j++) close = close && std::fabs(phi[l][j] - a.before->lane_phi[(column + l) * q + j]) < 0.5;
+            for (int j = 0; j < q; j++) d[j].set(l, close ? phi[l][j] - a.before->lane_phi[(column + l) * q + j] : 0.0);
+            if (!close) near.set(l, 0.0);
+            lost += !close;
+        }
+        if (2 * lost > wide_lanes) return false;
+        if (lost) recall(phi);
+        const std::ptrdiff_t old = std::ptrdiff_t(a.before->stages) * ep.n, olds = old + a.before->start[a.before->stages];
+        const auto own = [&](std::ptrdiff_t site, std::ptrdiff_t from, bool row, V* to_first, V* to_second) {
+            const double* p = a.before->lanes + from * a.columns + column;
+            V first = load(p), second = load(p + olds * a.columns), turn(0.0), move(0.0);
+            for (int j = 0; j < q; j++) {
+                turn += V(lead[2 * site * q + j]) * d[j];
+                move += V(lead[(2 * site + 1) * q + j]) * d[j];
+            }
+            if (any4((turn.v != X{}) | (move.v != X{}))) {
+                turn = V::of(exp4(max4(min4(turn.v, all<X>(6.0)), all<X>(-6.0))));
+                second = row ? second * turn : second / turn;
+                first = row ? first * turn + second * move : first + move;
+            }
+            *to_first = lost ? either(near.v > X{}, first, *to_first) : first;
+            *to_second = lost ? either(near.v > X{}, second, *to_second) : second;
+        };
+        for (int t = 0; t <= a.base.T; t++)
+            for (int i = 0; i < ep.n; i++) {
+                const std::ptrdiff_t from = ep_origin(*a.before, ep.n, t, i), to = std::ptrdiff_t(t) * ep.n + i;
+                if (from < 0) ep.start_noise(t, i);
+                else own(to, from, false, ep.s.m + to, ep.s.D + to);
+            }
+        for (int k = 0; k < a.base.rows; k++) {
+            const std::ptrdiff_t from = ep_origin(*a.before, k);
+            if (from < 0) ep.start_row(k);
+            else own(stage_count() + k, old + from, true, ep.s.nu + k, ep.s.tau + k);
+        }
+        return true;
+    }
+    // keep the lanes' sites, which belong to phi, for the window after
+    void hold(int column, const double (*phi)[ep_free]) {
+        const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
+        for (std::ptrdiff_t site = 0; site < sites; site++) {
+            const V first = site < stages ? ep.s.m[site] : ep.s.nu[site - stages];
+            const V second = site < stages ? ep.s.D[site] : ep.s.tau[site - stages];
+            double* p = a.lanes + site * a.columns + column;
+            __builtin_memcpy(p, &first, sizeof first);
+            __builtin_memcpy(p + sites * a.columns, &second, sizeof second);
+        }
+        for (int l = 0; l < wide_lanes; l++)
+            for (int j = 0; j < q; j++) a.lane_phi[(column + l) * q + j] = Ep<N>::alive(f, l) ? phi[l][j] : __builtin_nan("");
     }
 
     // evaluate the lanes; value[l] = log posterior up to a constant, slope[l][j]
-    void evaluate(const double (*phi)[ep_free], int most, double tol, double* value, double (*slope)[ep_free]) {
-        sweeps += ep.settle(f, most, tol, a.base.damping);
-        ep.look(f);
-        sweeps++;
+    void evaluate(const double (*phi)[ep_free], int most, double tol, double* value, double (*slope)[ep_free], Begin begin) {
+        bool done = false;
+        if (begin == resumed) {
+            sweeps += ep.settle_ends(f, most, tol, a.base.damping) / (a.base.T + 1) + 1;
+            ep.look(f);
+            done = ep.within(f, f.residual, tol);
+        } else if (begin == led) {
+            ep.hear();
+        }
+        if (!done) {
+            sweeps += ep.settle(f, most, tol, a.base.damping) + 1;
+            ep.look(f);
+        }
         for (int l = 0; l < wide_lanes; l++) {
             const bool sound = ep.sound(f, l);
             value[l] = sound ? f.log_z[l] + log_prior(phi[l], l) : minus_inf;
@@ -241,13 +319,13 @@ struct EpLearner {
     // the same with the bounds as a condition; where they alone have no evidence at the start they
     // are left a factor
     void evaluate_inside(const double (*phi)[ep_free], int most, double tol, double* value, double (*slope)[ep_free],
-                         bool first) {
+                         Begin begin, bool first) {
         if (outside) {
             outside->start();
-            sweeps += outside->settle(fo, most > ep_alone ? most : ep_alone, max2(tol, a.tol), a.base.damping) + 1;
+            sweeps += outside->settle(fo, most > ep_alone ? most : ep_alone, max2(tol, 0.3 * a.tol), a.base.damping) + 1;
             outside->look(fo);
         }
-        evaluate(phi, most, tol, value, slope);
+        evaluate(phi, most, tol, value, slope, begin);
         if (outside && first && value[0] > minus_inf && !outside->sound(fo, 0)) outside = nullptr;
         if (!outside) return;
         for (int l = 0; l < wide_lanes; l++) {
@@ -358,9 +436,10 @@ struct EpLearner {
                 at[l][j] += h[l];
             }
             for (int l = 0; l < wide_lanes; l++) put(l, at[l]);
-            if (k > 0 || warm) recall(at);
+            const Begin begin = k > 0 || warm ? led : afresh;
+            if (begin == led) recall(at);
             else ep.start();
-            evaluate_inside(at, k > 0 || warm ? a.few : a.many, a.tol, value, slope, *best == minus_inf);
+            evaluate_inside(at, begin == afresh ? a.many : a.few, 0.3 * a.tol, value, slope, begin, *best == minus_inf);
             if (!(value[0] > *best - 0.05 * q) && refused < 6) {  // too far, or no trajectory fits
                 refused++;
                 if (*best == minus_inf) {  // the start itself: wider half-widths fit more
@@ -565,9 +644,11 @@ struct EpLearner {
         }
         ep.block = {k, k + wide_lanes - 1};
         if (outside) outside->block = ep.block;
-        recall(at);
-        evaluate_inside(at, a.most, a.tol_nodes, value, slope, false);
-        ep.shapes(a.base.k3, a.base.k4, a.shaped);
+        const Begin begin = now.count > 1 && resume(k, at) ? resumed : led;
+        if (begin == led) recall(at);
+        evaluate_inside(at, a.most, a.tol_nodes, value, slope, begin, false);
+        if (now.count > 1) hold(k, at);
+        ep.shapes(a.base.k3, a.base.k4);
         const V more = ep.second();
         for (int l = 0; l < wide_lanes && k + l < end; l++) {
             for (int j = 0; j < q; j++) {
@@ -578,6 +659,17 @@ struct EpLearner {
             a.residuals[k + l] = f.residual[l];
             a.value[k + l] = inside[l] && value[l] > minus_inf ? value[l] + a.second[k + l] : minus_inf;
         }
+    }
+
+    // Whether the nodes lie where the posterior is: its mean near their first centre, and not the weight of a few.
+    bool central(int count, const double* mode, const double (*H)[ep_free], double effective) const {
+        for (int j = 0; j < q; j++) {
+            double mean = 0.0;
+            for (int k = 0; k < count; k++)
+                if (a.share[k] > 0.0) mean += a.share[k] * place_of(j, a.phi[k * q + j], mode[j]);
+            if (!(std::fabs(mean) * std::sqrt(H[j][j]) < a.near)) return false;
+        }
+        return effective > 3.0;
     }
 
     int run() {
@@ -596,6 +688,7 @@ struct EpLearner {
             ep.s.eps.set(l, a.rate);
             put(l, phi);
         }
+        for (int k = 0; k < a.columns * q; k++) a.lane_phi[k] = __builtin_nan("");
         const bool warm = b.warm;
         if (warm) {
             double from[ep_free];
@@ -615,7 +708,16 @@ struct EpLearner {
         double best = minus_inf;
         *a.log_prior = 0.0;
         int code = 0;
-        if (q > 0) {
+        const bool again = q > 0 && warm && a.before->lanes && a.before->since < a.again && a.before->drop <= ep_few &&
+                           b.T - a.before->common <= ep_few;
+        if (again) {  // where the nodes of the window before were
+            for (int j = 0; j < q; j++) {
+                phi[j] = min2(max2(a.before->mode[j], lo[j]), hi[j]);
+                for (int i = 0; i < q; i++) H[j][i] = a.before->H[j * q + i];
+            }
+            best = a.before->log_mode;  // in log s already
+            *a.log_prior = a.before->log_prior;
+        } else if (q > 0) {
             // far from the mode the evidence of the bounds alone misleads: first without it
             Ep<N>* const bounds = outside;
             outside = nullptr;
@@ -626,17 +728,18 @@ struct EpLearner {
                 code = climb(phi, H, &best, true);
                 if (code == 2) return 2;
             }
-            for (double keep = 1.0; !factor(H, keep, L); keep *= 0.7) {}
         } else {
             double at[wide_lanes][ep_free] = {}, value[wide_lanes], slope[wide_lanes][ep_free];
             if (warm) recall(at);
             else ep.start();
-            evaluate_inside(at, a.most, a.tol_nodes, value, slope, true);
+            evaluate_inside(at, a.most, a.tol_nodes, value, slope, warm ? led : afresh, true);
             if (value[0] == minus_inf) return 2;
             best = value[0];
             if (!(f.residual[0] < a.tol_nodes)) code = 1;
             remember(0, phi);
         }
+        if (q > 0)
+            for (double keep = 1.0; !factor(H, keep, L); keep *= 0.7) {}
         for (int j = 0; j < q; j++) {
             a.mode[j] = phi[j];
             for (int i = 0; i < q; i++) a.H[j * q + i] = H[j][i];
@@ -708,12 +811,15 @@ struct EpLearner {
         for (int j = 0; j < q; j++) {
             const double to_phi = group[j] >= 0 ? a.warp * phi[j] : 0.0;
             half_log_det += (nodes > 1 ? -std::log(stage[0].K[j][j]) : std::log(L[j][j])) - to_phi;
+            if (again) continue;
             *a.log_prior += to_phi;
             best += to_phi;
         }
         *a.log_mode = best;
         *a.log_evidence = log_sum + (nodes > 1 ? -std::log(static_cast<double>(done)) : 0.5 * q * log_2pi) - half_log_det;
         *a.sweeps_used = sweeps;
+        *a.since = again ? a.before->since + 1 : 0;
+        if (nodes == 1 || !central(done, phi, H, effective)) *a.since = a.again;
         return code;
     }
 };

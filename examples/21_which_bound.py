@@ -16,12 +16,8 @@ def main():
     told = hw.estimate(true.as_gaussian(), record, hw.KalmanSmoother())
     learned = hw.estimate(asked, record)  # Posterior: half-widths from the data
     print(f"learned  q = {learned.q.round(3)}, r = {learned.r.round(3)}   (truth .1 and .5)")
-    print("\nlevel   covered by Gaussian, told the truth   covered by Posterior, told nothing")
-    for level in (0.5, 0.8, 0.95):
-        shares = [
-            np.mean([(lo <= truth.x) & (truth.x <= hi)]) for lo, hi in (told.interval(level), learned.interval(level))
-        ]
-        print(f"{level:5.0%}   {shares[0]:29.1%}   {shares[1]:34.1%}")
+    for name, est in (("told the truth", told), ("told nothing", learned)):  # `.plot()` draws the diagram
+        print(f"\n{name}: {hw.coverage(est, truth, levels=(0.5, 0.8, 0.95))}")
 
     # One output in a hundred is off by ten half-widths: a Gaussian belief is dragged along, a named outlier is not.
     rng = np.random.default_rng(0)

@@ -35,7 +35,8 @@ def rows_of(problem, s):
             a[t * n : (t + 1) * n] = problem["h"][k]
             kind = int(problem["kind"][k])
             if kind == 0:
-                found.append((a, problem["y"][k], "gauss", problem["R"][k], t))
+                own = -1 if problem["group_R"] is None else problem["group_R"][k]
+                found.append((a, problem["y"][k], "gauss", problem["R"][k] + (s[own] ** 2 if own >= 0 else 0.0), t))
             elif kind == 1:
                 found.append((a, problem["y"][k], "box", s[problem["group"][k]], t))
             else:
@@ -44,8 +45,11 @@ def rows_of(problem, s):
     return found, size
 
 
-def base(problem, size):
-    """Return precision and shift of what is Gaussian from the start: a Normal x0 (half0 = 0) and the noise Q."""
+def base(problem, s, size):
+    """Return precision and shift of what is Gaussian from the start: a Normal x0 (half0 = 0) and the noise Q.
+
+    Q has the squares of the standard deviations besides that are groups.
+    """
     n = len(problem["m0"])
     K, h, log = np.zeros((size, size)), np.zeros(size), 0.0
     if not problem["half0"].any():
@@ -53,8 +57,13 @@ def base(problem, size):
         K[:n, :n] += W
         h[:n] += W @ problem["m0"]
         log += -0.5 * (problem["m0"] @ W @ problem["m0"] + np.linalg.slogdet(2 * np.pi * problem["P0"])[1])
-    if problem["Q"] is not None:
-        Q, W = problem["Q"][0], np.linalg.inv(problem["Q"][0])
+    Q = None if problem["Q"] is None else problem["Q"][0]
+    if problem["group_Q"] is not None:
+        G = np.eye(n) if problem["G"] is None else problem["G"][0]
+        own = np.array([s[g] ** 2 if g >= 0 else 0.0 for g in problem["group_Q"]])
+        Q = (G * own) @ G.T + (0.0 if Q is None else Q)
+    if Q is not None:
+        W = np.linalg.inv(Q)
         for t in range(1, size // n):
             J = np.zeros((n, size))
             J[:, t * n : (t + 1) * n] = np.eye(n)
@@ -105,7 +114,7 @@ def propagate(problem, s, sweeps=60):
     """Return mean (T + 1, n), covariances, log Z and what it lacks to second order."""
     factors, size = rows_of(problem, s)
     n = len(problem["m0"])
-    K0, h0, log0 = base(problem, size)
+    K0, h0, log0 = base(problem, s, size)
     a = np.array([f[0] for f in factors])
     b = np.array([f[1] for f in factors])
     tau = np.array([3 / f[3] ** 2 if f[2] == "box" else 1 / f[3] if f[2] == "gauss" else 0.0 for f in factors])

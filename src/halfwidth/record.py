@@ -48,6 +48,9 @@ class Labels:
     indexed: bool = False
 
 
+_UNNAMED = Labels()
+
+
 @dataclass(frozen=True, eq=False)
 class Record:
     """Outputs and inputs on one clock; row k is time ``t[k]``.
@@ -98,6 +101,13 @@ class Record:
                     hint="fill the input first: `Record(t, y, hold(u))`, for example with np.interp",
                 )
             put(self, "u", frozen(u))
+
+    @classmethod
+    def of(cls, t: Array, y: Array, u: Array | None, seen: NDArray[np.bool_]) -> "Record":
+        """Wrap rows that were judged already, such as some of a record's."""
+        record = object.__new__(cls)
+        record.__dict__.update(t=t, y=y, u=u, labels=_UNNAMED, seen=seen)
+        return record
 
     def __len__(self) -> int:
         return len(self.t)

@@ -31,7 +31,14 @@ def system(seed, n, ny, T, *, E=False, bounds=True, prior="box", e="uniform", w=
     if bounds:
         top = np.abs(truth).max(axis=0) * 1.02
         model = dataclasses.replace(model, bounds=(-top, np.where(np.arange(n) == 0, np.inf, top)))
-    return model, hw.Record(record.t, y), np.r_[q, r]
+    found, fitted = np.r_[q, r], np.r_[np.full(n, w == "fitted"), np.full(ny, e == "fitted")]
+    if fitted.any():  # the same sizes as standard deviations of unknown variances
+        unknown = hw.Gaussian.unknown()
+        model = dataclasses.replace(
+            model, w=unknown if w == "fitted" else model.w, e=unknown if e == "fitted" else model.e
+        )
+        found = np.r_[np.where(fitted, 0.0, found), np.where(fitted, found / np.sqrt(3), 0.0)]
+    return model, hw.Record(record.t, y), found
 
 
 CASES = {
@@ -42,6 +49,8 @@ CASES = {
     "normal prior": {"n": 2, "ny": 2, "T": 4, "prior": "normal"},
     "gaussian outputs": {"n": 2, "ny": 2, "T": 4, "e": "gaussian"},
     "gaussian states": {"n": 2, "ny": 1, "T": 4, "w": "gaussian", "prior": "normal", "missing": 0.0},
+    "deviations": {"n": 2, "ny": 2, "T": 4, "e": "fitted", "w": "fitted", "prior": "normal", "E": True},
+    "deviations beside boxes": {"n": 2, "ny": 2, "T": 4, "e": "fitted", "bounds": False},
     "many states": {"n": 5, "ny": 2, "T": 3},
     "nothing seen": {"n": 2, "ny": 1, "T": 3, "missing": 1.0},
 }
@@ -65,12 +74,12 @@ def test_it_equals_the_dense_twin(name):
     assert found["residual"][0] < 1e-9
 
 
-@pytest.mark.parametrize("name", ["bounds", "correlated", "many states"])
+@pytest.mark.parametrize("name", ["bounds", "correlated", "many states", "deviations", "deviations beside boxes"])
 def test_slopes_are_derivatives_of_the_evidence(name):
     model, record, s = system(4, **CASES[name])
     chain = sites(model, record)
     h = 1e-4
-    members = np.exp(np.log(s) + np.concatenate([np.zeros((1, s.size)), h * np.eye(s.size), -h * np.eye(s.size)]))
+    members = s * np.exp(np.concatenate([np.zeros((1, s.size)), h * np.eye(s.size), -h * np.eye(s.size)]))
     found = run(chain, members)
     numeric = (found["log_z"][1 : s.size + 1] - found["log_z"][s.size + 1 :]) / (2 * h)
     np.testing.assert_allclose(found["slope"][0, :-1], numeric, atol=1e-4)

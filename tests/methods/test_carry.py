@@ -180,10 +180,26 @@ def test_sites_go_along_with_their_rows():
         assert warm.estimate.status.good
 
 
-def test_a_snapshot_holds_what_is_carried():
+def test_nodes_that_are_taken_over_are_as_good_as_fresh_ones():
+    _, record = drawn(40, 11)
+    model = system(UNKNOWN, UNKNOWN, bounds=BOX)
+    known = Known(300.0 * np.sqrt(TRUE), 300.0 * np.eye(5))  # of rows before
+    start = None
+    for first in range(6):
+        part = hw.Record(record.t[first : first + 25], record.y[first : first + 25])
+        answer = hw.Posterior(nodes=20).answer(model, part, start=start, drop=1, known=known)
+        found, start = answer.found, answer.start
+        sound = np.isfinite(found["log_weight"])
+        s = np.exp(found["phi"][sound])
+        fresh = _core.ep_run(answer.chain.problem, s, np.zeros(len(s)), 200, 1e-9, 1.0, None)
+        np.testing.assert_allclose(found["slope"][sound], fresh["slope"][:, :5], atol=0.1)
+
+
+@pytest.mark.parametrize("memory", [6, 18])
+def test_a_snapshot_holds_what_is_carried(memory):
     _, record = drawn(60, 7)
     model = system(UNKNOWN, UNKNOWN)
-    live = hw.stream(model, hw.Window(hw.Posterior(nodes=8), memory=6))
+    live = hw.stream(model, hw.Window(hw.Posterior(nodes=8), memory=memory))
     for y in record.y[:40]:
         live.push(y)
     again = hw.resume(live.snapshot(), model)

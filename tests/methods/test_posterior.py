@@ -253,3 +253,35 @@ def test_refusals_say_what_to_do():
         assert "hint: " in method.refuses(model)
         with pytest.raises(hw.Refused):
             hw.estimate(model, hw.Record([1.0], [[0.0, 0.0]], [[0.0]]), method)
+
+
+def test_a_mode_in_the_corner_of_its_bounds_is_no_infeasibility():
+    rng = np.random.default_rng(0)
+    tight = hw.Uniform.unknown(0.04, 0.11), hw.Uniform.unknown(0.12, 0.31)
+    inside = []
+    for seed in range(8):
+        u = rng.uniform(-1, 1, (26, 1))
+        true = paper(hw.Uniform(0.109), hw.Uniform(0.309), hw.Box(-0.3 * np.ones(3), 0.3 * np.ones(3)))
+        truth, record = hw.simulate(true, u, seed=seed)
+        est = hw.estimate(paper(*tight, true.x0), record, hw.Posterior(nodes=16))
+        assert est.status.good
+        lo, hi = est.interval(0.95)
+        inside.append(np.mean((lo <= truth.x) & (truth.x <= hi)))
+    assert np.mean(inside) > 0.85
+
+
+def test_more_unknowns_than_it_finds_are_refused():
+    n = 9
+    many = hw.Linear(0.9 * np.eye(n), None, np.eye(n), UNKNOWN, UNKNOWN, hw.Box(-np.ones(n), np.ones(n)))
+    assert "18 are unknown" in hw.Posterior().refuses(many)
+    assert hw.estimate(many, hw.Record([1.0, 2.0], np.zeros((2, n)))).method == "BatchLP()"
+    told = dataclasses.replace(many, e=hw.Uniform.unknown(np.full(n, 0.3), [0.3] * 5 + [1.0] * 4))
+    assert hw.Posterior().refuses(told) is None
+
+
+def test_an_output_gain_is_found_though_none_fits_in_the_middle():
+    true = hw.Linear([[0.9]], None, [[1.0], [1.0]], hw.Uniform(0.2), hw.Uniform(0.3), hw.Box([-1], [1]))
+    _, record = hw.simulate(true, T=60, seed=1)
+    asked = dataclasses.replace(true, C=[[np.nan], [1.0]], w=UNKNOWN, e=UNKNOWN, theta_bounds=(-2.0, 2.0))
+    est = hw.estimate(asked, record, hw.Posterior(nodes=8))
+    assert est.theta[0] == pytest.approx(1.0, abs=0.3)

@@ -322,3 +322,11 @@ def test_on_the_command_line_each_fault_is_named_with_the_line_to_type(drive, tm
     said_there = "".join(capsys.readouterr())
     assert "where the vehicle cannot have been" in said_there
     assert "receiver would have seen the vehicle" in said_there
+
+
+@pytest.mark.parametrize(("begin", "length"), [(96.7, 30.0), (135.4, 5.0), (165.7, 10.0)])
+def test_a_jump_of_the_slow_error_beside_a_gap_is_no_fault(data, begin, length):
+    # the reference of this log jumps by 1 to 2 m some seconds after the gap, or before it
+    log = read(next(data.glob("smartloc*.csv.gz"))).without(begin, begin + length)
+    known = calibrated(log)
+    assert strays(sampled(log, sensors=known), known).at.size == 0

@@ -1,4 +1,5 @@
 import dataclasses
+import importlib
 import sys
 import time
 
@@ -8,7 +9,7 @@ from tests.vehicle.known import FRAME, known, real_log
 
 import halfwidth as hw
 from halfwidth.errors import BadLog, BadValue
-from halfwidth.vehicle import estimators
+from halfwidth.vehicle import calibrate, estimators
 from halfwidth.vehicle.fill import fill
 from halfwidth.vehicle.frames import Frame
 from halfwidth.vehicle.log import Log
@@ -496,3 +497,45 @@ def test_untested_half_widths_have_a_floor(data):
         assert any("widened 2 times" in message for message in track.messages)
         shares.append(_against_hidden(log, track, [(log.t[0], log.t[-1])])[2])
     assert np.mean(shares) > 0.8
+
+
+@pytest.mark.parametrize("name", ["ep", "slp"])
+def test_what_a_method_has_learnt_is_kept_when_fixes_are_hidden(monkeypatch, name):
+    made = known(70.0, rate=2.0, noise=0.1, speed_noise=0.05, yaw_noise=0.003)
+    log = made.log.without(30, 36)
+    usual = estimators.METHODS[name]
+    calls = []
+
+    def run(drives, tuned):
+        calls.append(len(drives))
+        return usual.run(drives, tuned)
+
+    monkeypatch.setattr(estimators, "METHODS", {**estimators.METHODS, name: dataclasses.replace(usual, run=run)})
+    track = fill(log, method=name)
+    assert calls == [1]  # the drive with all its fixes; hidden ones are filled with what that gave
+    assert track.benchmark
+    assert track.method == name
+    assert max(one["mean_m"] for one in track.benchmark) < 1.0
+    assert made.error(track.t_s, track.lat_deg, track.lon_deg).max() < 2.0
+
+
+def _shown(name, sizes, guessed=False):
+    return [
+        calibrate.Tested(length, 8, size, size, 0.9, 1.0, by=name, half_m=1.0, guessed=guessed)
+        for length, size in sizes
+    ]
+
+
+def test_another_way_must_be_better_at_all_lengths_where_the_sensors_speak():
+    nearest = importlib.import_module("halfwidth.vehicle.fill")._nearest
+    usual = _shown("em", [(5.0, 1.0), (20.0, 4.0), (60.0, 16.0)])
+    lucky = _shown("em-white", [(5.0, 1.3), (20.0, 5.0), (60.0, 8.0)])
+    better = _shown("em-white", [(5.0, 0.6), (20.0, 2.0), (60.0, 8.0)])
+    assert nearest({"em": usual, "em-white": lucky}, "em", 60.0) == "em"
+    assert nearest({"em": usual, "em-white": better}, "em", 60.0) == "em-white"
+    assert nearest({"em": usual}, "em", 60.0) == "em"
+    assert nearest({}, "em", 60.0) == "em"
+    # where what the vehicle did is guessed a short gap and a long one are two things
+    blind, cv = (_shown(n, s, guessed=True) for n, s in (("em", [(5, 1.0), (60, 9.0)]), ("cv", [(5, 0.5), (60, 90.0)])))
+    assert nearest({"em": blind, "cv": cv}, "em", 5.0) == "cv"
+    assert nearest({"em": blind, "cv": cv}, "em", 60.0) == "em"

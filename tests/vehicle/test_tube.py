@@ -96,3 +96,19 @@ def test_fill_sizes_the_band_and_calls_it_no_guarantee():
     assert track.proven is None
     assert any("not guaranteed" in message for message in track.messages)
     assert made.error(track.t_s, track.lat_deg, track.lon_deg).max() < 3.0
+
+
+def test_a_tube_of_what_was_learnt_before_is_about_the_same():
+    drive = a_drive()
+    hidden = drive.without(20, 26)
+    (whole,), (afresh,) = tube.solve([drive]), tube.solve([hidden])
+    (again,) = tube.again([hidden], [whole])
+    assert again.status.good
+    assert again.info["half_widths"] == whole.info["half_widths"]
+    gap = (drive.t > 20) & (drive.t < 26)
+    apart = np.hypot(again.east - afresh.east, again.north - afresh.north)[gap]
+    assert apart.max() < 0.5 * half_of(afresh)[gap].max()
+    assert half_of(again)[gap].max() > 1.5 * half_of(whole)[gap].max()
+    # without a tube nothing was learnt that could be kept
+    failed = dataclasses.replace(whole, variance=None, info={})
+    np.testing.assert_allclose(tube.again([hidden], [failed])[0].east, afresh.east)

@@ -24,6 +24,7 @@ References
 Varin, Reid and Firth (2011), An overview of composite likelihood methods, Statistica Sinica 21. Minka (2001), UAI.
 """
 
+import base64
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -42,6 +43,9 @@ WARP = 0.5
 #: Sweeps of the chain with its bounds alone, and the log share of a cavity inside a bound from which it is believed.
 _SWEEPS, _WORST = 50, -60.0
 
+
+#: What the core found in a window and takes up in the next, beside the sites of the mode.
+HANDED_ON = ("lanes", "lane_phi", "mode", "H", "log_mode", "log_prior", "since")
 
 #: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone
 #: shape the path. In longer records bounds are a condition in the others.
@@ -99,12 +103,12 @@ def inside(chain: Sites, s: Array) -> Known:
 class Start(NamedTuple):
     """Where a search may start: half-widths (p,), and the sites of a solved chain that belong to them.
 
-    These are the first row of each of its stages (T + 2,), m and D of its noise, tau and nu of its rows (`EpBefore` in
-    core/ep_entry.hpp).
+    These are the first row of each of its stages (T + 2,), m and D of its noise, tau and nu of its rows, and
+    `HANDED_ON` (`EpBefore` in core/ep_entry.hpp).
     """
 
     s: Array
-    before: tuple[Array, ...] | None = None
+    before: tuple[Any, ...] | None = None
 
 
 class Carried:
@@ -190,7 +194,7 @@ class Carried:
             "waiting": [[k, _plain(told), _plain(inside)] for k, told, inside in self.waiting],
             "count": self.count,
             "s": None if start is None else start.s.tolist(),
-            "before": None if start is None or start.before is None else [np.ravel(v).tolist() for v in start.before],
+            "before": None if start is None or start.before is None else [_bytes(v) for v in start.before],
             "first": None if self.first is None else [self.first.mean.tolist(), self.first.P.tolist()],
             "edge": None if self._edge is None else [v.tolist() for v in self._edge],
         }
@@ -206,7 +210,8 @@ class Carried:
         if saved["s"] is not None:
             before = saved["before"]
             if before is not None:
-                before = (np.array(before[0], dtype=np.int32), *(np.array(v, dtype=float) for v in before[1:]))
+                start, *values, log_mode, log_prior, since = (_array(v) for v in before)
+                before = (start.astype(np.int32), *values, float(log_mode[0]), float(log_prior[0]), int(since[0]))
             self.start = Start(np.array(saved["s"], dtype=float), before)
         first, edge = saved["first"], saved["edge"]
         self.first = None if first is None else Normal(*first)
@@ -219,3 +224,12 @@ def _plain(known: Known) -> list[Any]:
 
 def _known(saved: list[Any]) -> Known:
     return Known(*(np.array(v, dtype=float) for v in saved))
+
+
+def _bytes(value: Any) -> str:
+    """Return numbers as text, all bits of them."""
+    return base64.b64encode(np.ascontiguousarray(value, dtype="<f8").tobytes()).decode()
+
+
+def _array(text: str) -> Array:
+    return np.frombuffer(base64.b64decode(text), dtype="<f8").astype(float)

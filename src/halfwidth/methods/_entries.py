@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 _STEPS = 40
 _NODES = 24
+#: Points that are tried where nothing fits in the middle of the bounds.
+_ELSEWHERE = 20
 
 
 def with_entries(method: "Posterior", model: Linear, record: Record) -> Estimate:
@@ -99,7 +101,13 @@ class _Search:
 
         theta = self.first
         if math.isinf(self.at(theta)):
-            return theta, False
+            # Nothing fits there, as where an unknown output gain is 0: look elsewhere between the bounds.
+            width = np.where(np.isfinite(self.hi - self.lo), self.hi - self.lo, 2.0)
+            points = np.random.default_rng(20260).uniform(-0.45, 0.45, (_ELSEWHERE, len(theta))) * width + theta
+            values = [self.at(point) for point in points]
+            if math.isinf(max(values)):
+                return theta, False
+            theta = points[int(np.argmax(values))]
         span = np.where(np.isfinite(self.hi - self.lo), self.hi - self.lo, 1.0)
         size = 1e-3 * span
 

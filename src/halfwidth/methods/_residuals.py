@@ -242,34 +242,42 @@ def first_scales(model: Linear, seen: Sequence[Array]) -> Array:
     seen : sequence of arrays
         The seen values of each output, in order.
     """
-    nx, ny = model.nx, model.ny
-    sigma = np.ones(nx + ny)
+    return scales(felt(model), seen)
+
+
+def scales(effect: Array, seen: Sequence[Array]) -> Array:
+    """Return the first scales of a model with this `felt`."""
+    ny, nx = effect.shape
+    sigma, weight = np.ones(nx + ny), np.zeros(ny)
     for j, y in enumerate(seen):
         level = np.abs(y[1:] - y[:-1]).sum() / max(len(y) - 1, 1)
         if not level > 0 and len(y):
             level = np.std(y)
         if level > 0:
             sigma[nx + j] = level
-
-    def typical(matrix: Varying | None, n: int) -> Array:
-        if matrix is None:
-            return np.eye(n)
-        one = matrix.value if matrix.value is not None else matrix.at(0.0, model.dt)
-        return one if one.ndim == 2 else one.mean(axis=0)
-
-    C = np.ascontiguousarray(typical(model.C, nx), dtype=float)
-    felt = _felt(
-        nx, *(np.ascontiguousarray(typical(v, nx), dtype=float).tobytes() for v in (model.E, model.A)), C.tobytes()
-    )
-    weight = np.array([1.0 / s**2 if len(y) else 0.0 for s, y in zip(sigma[nx:], seen, strict=True)])
-    gram = weight @ felt
-    sigma[:nx][gram > 0] = 1.0 / np.sqrt(gram[gram > 0])
+        if len(y):
+            weight[j] = 1.0 / sigma[nx + j] ** 2
+    gram = weight @ effect
+    told = gram > 0
+    sigma[:nx][told] = 1.0 / np.sqrt(gram[told])
     return sigma
+
+
+def felt(model: Linear) -> Array:
+    """Return what a unit disturbance of each state does to each output: sums of squares over later rows, (ny, nx)."""
+    nx = model.nx
+
+    def typical(matrix: Varying | None) -> bytes:
+        if matrix is None:
+            return np.eye(nx).tobytes()
+        one = matrix.value if matrix.value is not None else matrix.at(0.0, model.dt)
+        return np.ascontiguousarray(one if one.ndim == 2 else one.mean(axis=0), dtype=float).tobytes()
+
+    return _felt(nx, typical(model.E), typical(model.A), typical(model.C))
 
 
 @functools.lru_cache(maxsize=256)
 def _felt(nx: int, E: bytes, A: bytes, C: bytes) -> Array:
-    """Return what a unit disturbance of each state does to each output: sums of squares over later rows, (ny, nx)."""
     inverse = np.linalg.inv(np.frombuffer(E).reshape(nx, nx))
     Phi = inverse @ np.frombuffer(A).reshape(nx, nx)
     H = np.frombuffer(C).reshape(-1, nx)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.array import Array
-from halfwidth.methods._residuals import _eliminate, first_scales, reference, residuals
+from halfwidth.methods._residuals import _eliminate, felt, reference, residuals, scales
 from halfwidth.model import Linear, Model
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
 from halfwidth.record import Record
@@ -103,8 +103,12 @@ class Frame:
         Inputs to what is added to the state; None: as the rows of the record have it.
     Y : (K, ny) array
         Seen outputs of its row to the target of each row of the chain.
-    R : (ny,) array
-        Variances of Gaussian outputs; infinite where the noise has a bounded part.
+    at : (K,) array
+        That row; 0 where it is a bound, whose target is 0.
+    felt : (ny, nx) array
+        As `felt` in `_residuals`.
+    R : (ny,) array or None
+        Variances of Gaussian outputs; None where the noise has a bounded part.
     """
 
     problem: dict[str, Any]
@@ -118,11 +122,16 @@ class Frame:
     output: NDArray[np.intp]
     B: Array | None
     Y: Array
-    R: Array
+    at: NDArray[np.intp]
+    felt: Array
+    R: Array | None
 
-    def fits(self, scale: Array, top: float) -> bool:
-        """Say whether no variance is so small beside outputs of these scales (p,) and this size that it is lifted."""
-        return bool((2.0 * _EXACT * np.maximum(scale[-len(self.R) :], math.sqrt(_EXACT) * top) ** 2 < self.R).all())
+    def fits(self, scale: Array, y: Array) -> bool:
+        """Say whether no variance is so small beside the outputs y (T, ny), of scale (p,), that it is lifted."""
+        if self.R is None:
+            return True
+        size = np.maximum(scale[-len(self.R) :], math.sqrt(_EXACT) * np.abs(y).max())
+        return bool((2.0 * _EXACT * size**2 < self.R).all())
 
 
 #: Frames that are kept of one model.
@@ -135,12 +144,13 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
     `frames` keeps what windows of one model have in common, where its matrices are constant.
     """
     y = np.where(record.seen, record.y, 0.0)
-    scale = first_scales(model, [record.y[record.seen[:, j], j] for j in range(model.ny)])
     kept, frame = b"", None
     if frames is not None and isinstance(model.x0, Normal):
         kept = record.seen.tobytes()
         frame = frames.get(kept)
-    if frame is None or not frame.fits(scale, float(np.abs(y).max())):
+    effect = felt(model) if frame is None else frame.felt
+    scale = scales(effect, [record.y[record.seen[:, j], j] for j in range(model.ny)])
+    if frame is None or not frame.fits(scale, y):
         frame = _frame(model, record, scale, outliers)
         if frames is not None and kept and _constant(model):
             if len(frames) >= _FRAMES:
@@ -151,8 +161,7 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
         problem["b"] = _added(model, record)
     else:
         problem["b"] = np.zeros((len(record), model.nx)) if record.u is None else record.u @ frame.B.T
-    # bounds have no output, and the target 0
-    problem["y"] = np.einsum("kj,kj->k", frame.Y, y[np.maximum(frame.row, 0)])
+    problem["y"] = (frame.Y * y.take(frame.at, axis=0)).sum(axis=1)
     floor, cap, fitted = frame.floor, frame.cap, frame.fitted
     if fitted.any():
         scale = np.resize(scale, len(fitted))
@@ -209,17 +218,31 @@ def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame
         B = np.zeros((nx, model.nu)) if model.B is None else model.B.single
         B = B if problem["G"] is None else problem["G"][0] @ B
     part = gaussian_part(model.e)
-    R = np.full(ny, np.inf)
+    R = None
     if part is not None and uniform_part(model.e) is None and part.known and part.cov().constant:
         R = np.diagonal(part.cov().single)
-    Y = joined("Y", float, (ny,))
-    return Frame(problem, free, floor, cap, count, uniform, fitted, stage[order] - 1, output, B, Y, R)
+    row = stage[order] - 1
+    return Frame(
+        problem, free, floor, cap, count, uniform, fitted, row, output, B, joined("Y", float, (ny,)),
+        np.maximum(row, 0), felt(model), R,
+    )  # fmt: skip
 
 
 def groups(model: Model) -> int:
     """Return the number of groups that the chain of a model has."""
     once = model.nx + model.ny
     return once if all(part is None or part.known for part in map(gaussian_part, (model.w, model.e))) else 2 * once
+
+
+def unknowns(model: Model) -> int:
+    """Return how many half-widths and variances of a model are to be found."""
+    count = 0
+    for noise, n in ((model.w, model.nx), (model.e, model.ny)):
+        box, part = uniform_part(noise), gaussian_part(noise)
+        ends = [] if box is None else [np.array([np.broadcast_to(v, n) for v in (box.at_least, box.at_most)])]
+        for lo, hi in [*ends, _ends(part, n)]:
+            count += int(np.count_nonzero(lo < hi))
+    return count
 
 
 def _groups(model: Linear) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:

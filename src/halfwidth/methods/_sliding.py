@@ -13,7 +13,6 @@ References
 Pavelková and Kárný (2013), secs. 2, 5.1, 5.2.
 """
 
-import copy
 import json
 import math
 from dataclasses import replace
@@ -89,17 +88,20 @@ class Forecasts:
 
     def move(self, model: Model, record: Record, k: int, x: Array) -> Array:
         """Move on to row k; returns what is expected after x, the estimate of the row before."""
-        moved = expected(model, record, k, np.vstack([x, self.x]))
+        moved = expected(model, record, k, np.concatenate((x[None], self.x)))
         if len(self.q):
             self.grown = growth(model, record, k, x, self.grown, self.q.max(axis=0))
         if isinstance(model.bounds, Box):
-            moved = np.clip(moved, model.bounds.lo, model.bounds.hi)
+            moved = np.minimum(np.maximum(moved, model.bounds.lo), model.bounds.hi)
         self.x = moved[1:]
         return np.asarray(moved[0])
 
     def take(self, x: Array, q: Array, memory: int) -> None:
         """Add the estimate of a window that ends in a fix."""
-        self.x, self.q = np.vstack([self.x, x])[-memory - 1 :], np.vstack([self.q, q])[-memory - 1 :]
+        self.x, self.q = (
+            np.concatenate((self.x, x[None]))[-memory - 1 :],
+            np.concatenate((self.q, q[None]))[-memory - 1 :],
+        )
         self.grown = np.zeros_like(self.grown)
 
     def bounds(self) -> tuple[Array, Array, int]:
@@ -116,7 +118,9 @@ class Sliding:
     ----------
     first : int
         Number of the first row held.
-    x, low, high : lists of (nx,) arrays
+    times, y, u : (n,), (n, ny), (n, nu) arrays
+        The rows held.
+    x, low, high : (n + 1, nx) arrays
         Newest, least and largest estimate of each state held: the one before the first row, then one a row.
     """
 
@@ -124,12 +128,11 @@ class Sliding:
         self.window, self.model, self.seed = window, model, seed
         self.t, self.before = t, t  # time of the newest row, and of the one before the first held
         self.first = self.pushed = 0
-        self.times: list[float] = []
-        self.y: list[Array] = []
-        self.u: list[Array] = []
-        x0 = model.x0.mean
-        self.x: list[Array] = [np.asarray(x0, dtype=float)]
-        self.low, self.high = [np.full(model.nx, np.inf)], [np.full(model.nx, -np.inf)]
+        self.times, self.y, self.u = np.zeros(0), np.zeros((0, model.ny)), np.zeros((0, model.nu))
+        self.seen = np.zeros((0, model.ny), dtype=bool)
+        self.x = np.array(model.x0.mean, dtype=float)[None]
+        self.low, self.high = np.full((1, model.nx), np.inf), np.full((1, model.nx), -np.inf)
+        self.knows = not getattr(model, "theta_entries", ()) or isinstance(window.method, SequentialLP)
         self.used = np.zeros(model.ny, dtype=bool)  # outputs seen before the first row held
         self.edge = np.ones(model.ny, dtype=bool)  # ... and in the row right before it
         self.since = 0  # rows since any output was seen
@@ -144,15 +147,15 @@ class Sliding:
         """Fold one row in: solve the window that ends in it."""
         window, model = self.window, self.model
         self.t += dt
-        self.times.append(self.t)
-        self.y.append(y)
+        self.times = np.concatenate((self.times, (self.t,)))
+        self.y = np.concatenate((self.y, y[None]))
+        self.seen = seen = np.concatenate((self.seen, ~np.isnan(y)[None]))
         if u is not None:
-            self.u.append(u)
+            self.u = np.concatenate((self.u, u[None]))
         self.pushed += 1
-        seen = ~np.isnan(np.array(self.y))
         a = int(window_starts(seen, window.memory, fixes=window.fixes, stretch=window.stretch)[-1])
         last = window_lasts(seen, window.memory, self.used, self.edge)  # by place: the first is before the rows held
-        part = Record(np.array(self.times[a:]), np.array(self.y[a:]), np.array(self.u[a:]) if model.nu else None)
+        part = Record.of(self.times[a:], self.y[a:], self.u[a:] if model.nu else None, seen[a:])
         if self.carried is not None:
             self.carried.leave(a)
         local = self._local(a, len(self.times) - 1 >= last[a])
@@ -163,20 +166,21 @@ class Sliding:
         known = local
         if isinstance(local, Linear) and isinstance(method, SequentialLP):
             known = filled(local, self.theta[: len(local.theta_entries)])
-        knows = not getattr(known, "theta_entries", ())
-        self.x.append(self.ahead.move(known, part, len(part) - 1, self.x[-1]) if knows else self.x[-1])
+        newest = self.ahead.move(known, part, len(part) - 1, self.x[-1]) if self.knows else self.x[-1]
+        self.x = np.concatenate((self.x, newest[None]))
         fresh = self.since == 0 or self.last is None or not isinstance(method, BatchLP | SequentialLP)
         if fresh:
             solved = self._solve(local, part, a)
             self._note_all(a, solved.x, last)
-            if self.since == 0 and knows and solved.status.good:
-                self.ahead.take(solved.x[-1], np.nan_to_num(solved.s[: model.nx]), window.memory)
+            if self.since == 0 and self.knows and solved.status.good:
+                q = solved.s[: model.nx]
+                self.ahead.take(solved.x[-1], np.where(np.isnan(q), 0.0, q), window.memory)
         else:
             assert self.last is not None
-            solved = self.last._replace(x=np.array(self.x[a:]), iterations=0)
+            solved = self.last._replace(x=self.x[a:].copy(), iterations=0)
             self._note(len(self.x) - 1, self.x[-1], last)
         self.last = solved
-        self._forget(a, seen)
+        self._forget(a)
         return solved
 
     def back(self) -> int:
@@ -186,34 +190,39 @@ class Sliding:
     def _note_all(self, a: int, x: Array, last: NDArray[np.int32]) -> None:
         """Note the estimates x of the states from a on; the newest one has none so far."""
         held = len(self.low) - a
-        open_ = (len(self.times) - 1 <= last[a : a + held])[:, None]
-        low, high = np.array(self.low[a:]), np.array(self.high[a:])
-        self.low[a:] = [*np.where(open_, np.minimum(low, x[:held]), low), *x[held:].copy()]
-        self.high[a:] = [*np.where(open_, np.maximum(high, x[:held]), high), *x[held:].copy()]
-        self.x[a:] = list(x)
+        low, high = self.low[a:], self.high[a:]
+        if len(self.times) - 1 <= last[a : a + held].min():
+            low, high = np.minimum(low, x[:held]), np.maximum(high, x[:held])
+        else:
+            open_ = (len(self.times) - 1 <= last[a : a + held])[:, None]
+            low, high = (
+                np.where(open_, np.minimum(low, x[:held]), low),
+                np.where(open_, np.maximum(high, x[:held]), high),
+            )
+        self.low = np.concatenate((self.low[:a], low, x[held:]))
+        self.high = np.concatenate((self.high[:a], high, x[held:]))
+        self.x[a:] = x
 
     def _note(self, k: int, x: Array, last: NDArray[np.int32]) -> None:
         self.x[k] = x
         if k == len(self.low):
-            self.low.append(x.copy())
-            self.high.append(x.copy())
+            self.low, self.high = np.concatenate((self.low, x[None])), np.concatenate((self.high, x[None]))
         elif len(self.times) - 1 <= last[k]:
             self.low[k], self.high[k] = np.minimum(self.low[k], x), np.maximum(self.high[k], x)
 
-    def _forget(self, a: int, seen: NDArray[np.bool_]) -> None:
+    def _forget(self, a: int) -> None:
         """Let go of the first a rows held: starts never move back."""
         if a == 0:
             return
-        self.before = self.times[a - 1]
-        self.used, self.edge = self.used | seen[:a].any(axis=0), seen[a - 1]
+        self.before = float(self.times[a - 1])
+        self.used, self.edge = self.used | self.seen[:a].any(axis=0), self.seen[a - 1]
         self.first += a
-        del self.times[:a], self.y[:a], self.x[:a], self.low[:a], self.high[:a]
-        if self.u:
-            del self.u[:a]
+        self.times, self.y, self.u, self.seen = self.times[a:], self.y[a:], self.u[a:], self.seen[a:]
+        self.x, self.low, self.high = self.x[a:], self.low[a:], self.high[a:]
 
     def _local(self, a: int, finished: bool) -> Model:
         """Return the model of the rows from a on: stacked matrices cut, the box of its first state."""
-        changes: dict[str, Any] = {"dt": self.times[a] - (self.times[a - 1] if a else self.before)}
+        changes: dict[str, Any] = {"dt": float(self.times[a] - (self.times[a - 1] if a else self.before))}
         model, rows = self.model, slice(self.first + a, self.first + len(self.times))
         if isinstance(model, Linear):
             for name, matrix in model.matrices.items():
@@ -227,9 +236,8 @@ class Sliding:
             held = interval(self.low[a], self.high[a], self.window.memory, self.window.carry) if finished else None
             changes["x0"] = box if held is None else meet(box, held)
         if changes.keys() <= {"dt", "x0"}:  # both judged already
-            local = copy.copy(model)
-            for name, value in changes.items():
-                object.__setattr__(local, name, value)
+            local = object.__new__(type(model))
+            local.__dict__.update(model.__dict__, **changes)
             return local
         return replace(model, **changes)
 
@@ -252,7 +260,8 @@ class Sliding:
         s = _both(est.q, est.r, model)
         variances = None if est.Q is None and est.R is None else _both(est.Q, est.R, model)
         return Solved(
-            np.vstack([est.info.get("x0", self.x[a]), est.x]), np.zeros(0) if est.theta is None else est.theta, s,
+            np.concatenate((est.info.get("x0", self.x[a])[None], est.x)),
+            np.zeros(0) if est.theta is None else est.theta, s,
             est.status, int(est.info.get("iterations", 0) or 0), info, est.spread, variances,
         )  # fmt: skip
 
@@ -297,7 +306,7 @@ class Sliding:
     def _linearised(self, method: SequentialLP, model: Model, part: Record, a: int) -> Solved:
         """Solve the window about the one before: its states, the newest one as the model expects it, and its theta."""
         rows: Any = rows_of(model, part, method.drift)
-        x, theta = np.array(self.x[a:]), self.theta
+        x, theta = self.x[a:].copy(), self.theta
         c = np.ones(rows.groups)
         if isinstance(model, Nonlinear) or method.objective == "log" or method.point == "least_squares":
             early = self.pushed <= self.window.memory
@@ -340,7 +349,8 @@ class Sliding:
 
         last = self.last
         return {
-            "t": self.t, "before": self.before, "first": self.first, "pushed": self.pushed, "times": self.times,
+            "t": self.t, "before": self.before, "first": self.first, "pushed": self.pushed,
+            "times": self.times.tolist(),
             "y": plain(self.y), "u": plain(self.u), "x": plain(self.x), "low": plain(self.low),
             "high": plain(self.high), "used": self.used.tolist(),
             "edge": self.edge.tolist(), "since": self.since,
@@ -364,12 +374,15 @@ class Sliding:
 
         self.t, self.before = float(saved["t"]), float(saved["before"])
         self.first, self.pushed = int(saved["first"]), int(saved["pushed"])
-        self.times = [float(v) for v in saved["times"]]
-        self.y, self.u, self.x = arrays(saved["y"]), arrays(saved["u"]), arrays(saved["x"])
-        self.low, self.high = arrays(saved["low"], math.inf), arrays(saved["high"], -math.inf)
+        self.times = np.array(saved["times"], dtype=float)
+        nx, ny, nu = self.model.nx, self.model.ny, self.model.nu
+        self.y, self.u = (np.array(arrays(saved[k])).reshape(len(saved[k]), n) for k, n in (("y", ny), ("u", nu)))
+        self.seen = ~np.isnan(self.y)
+        self.x, self.low, self.high = (
+            np.array(arrays(saved[k], lost)) for k, lost in (("x", math.nan), ("low", math.inf), ("high", -math.inf))
+        )
         self.used, self.edge = np.array(saved["used"], dtype=bool), np.array(saved["edge"], dtype=bool)
         self.since = int(saved["since"])
-        nx = self.model.nx
         x, q, grown = saved["ahead"]
         self.ahead.x, self.ahead.q = np.array(x, dtype=float).reshape(-1, nx), np.array(q, dtype=float).reshape(-1, nx)
         self.ahead.grown = np.array(grown, dtype=float)
@@ -454,7 +467,7 @@ class Live:
         back = held.back()
         ago = slice(-1 - back, -back or None)
         return Estimate(
-            np.array(held.times[ago]),
+            held.times[ago].copy(),
             held.x[-1 - back][None].copy(),
             None if solved.spread is None else rows_of_spread(solved.spread, ago),
             solved.status,

@@ -38,16 +38,15 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
-from halfwidth.methods._carry import WARP, Carried, Known, Start, condition
+from halfwidth.methods._carry import HANDED_ON, WARP, Carried, Known, Start, condition
 from halfwidth.methods._protocol import typed
-from halfwidth.methods._sites import Frame, Sites, gaussian_part, sites, uniform_part
+from halfwidth.methods._sites import Frame, Sites, gaussian_part, sites, uniform_part, unknowns
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box, Normal, Shaped
 
-_STATUS = (Status.OK, Status.STALLED, Status.INFEASIBLE, Status.STALLED)
 #: Power of the half-widths' prior; see above.
 POWER = 0.6
 #: Nodes of a stage, and most stages (core/ep_learn.hpp).
@@ -66,10 +65,13 @@ _LIMITS = {
 _LONG = 2000
 _FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
+#: A window takes over the mode of the one before at most so often in a row and in an eighth of its rows: not at all, since
+#: stages of nodes about an old mode were found to lose what a stream knows. Sites are taken over in any case.
+_AGAIN = 0
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
-_MIXED = {"most": 20, "damping": 0.5}
+_MIXED = {"most": 20, "few": 8, "damping": 0.5}
 #: Moments that agree this well, in standard deviations, are good, and good enough to be used.
 _FINE, _USABLE = 0.01, 0.1
 #: Fewer effective nodes than this leave an integral over half-widths rough.
@@ -77,6 +79,7 @@ _FEW = 3.0
 #: Beta prior of a contamination rate that is learned.
 _RATE = (1.0, 30.0)
 _MOST_STATES = 16
+_MOST_UNKNOWN = 16
 
 
 @dataclass(frozen=True)
@@ -165,6 +168,12 @@ class Posterior:
             return (f"cannot draw: {why}", hint) if reason else (None, "")
         if model.nx > _MOST_STATES:
             return f"takes at most {_MOST_STATES} states but the model has {model.nx}", "a smaller model"
+        unknown = unknowns(model) + (self.outliers is True or (model.loss is not None and not model.loss.known))
+        if unknown > _MOST_UNKNOWN:
+            return (
+                f"finds at most {_MOST_UNKNOWN} half-widths and variances but {unknown} are unknown",
+                "BatchLP(), or known ones such as Uniform.unknown(at_least=q, at_most=q)",
+            )
         if isinstance(model, Nonlinear) and model.loss is not None:
             return "takes no loss of a nonlinear model", "RBPF() or ParticleFilter()"
         if model.bounds is not None:
@@ -271,13 +280,14 @@ class Posterior:
     def _solve(
         self, chain: Sites, model: Linear, start: Start | None, drop: int, known: Known | None, shaped: int
     ) -> dict[str, Any]:
-        rate, learn_rate, beta = self._rate(model)
+        rate, learn_rate, _ = self._rate(model)
         first = np.where(chain.free, chain.guess, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
         if start is not None:
             first = np.where(chain.free, start.s.clip(chain.floor, chain.cap), first)
         q = int(chain.free.sum()) + learn_rate
         limits = dict(_LIMITS)
         limits["condition"] = condition(len(chain.problem["start"]) - 2) if known is None else 0.0  # `known` sees to it
+        limits["again"] = min((len(chain.problem["start"]) - 2) // 8, _AGAIN)
         rows = max(float(chain.count.sum()), 1.0)
         limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
         limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
@@ -285,13 +295,26 @@ class Posterior:
             limits |= _OF_LONG
         n = len(chain.problem["m0"])
         room = int(_ROOM / (len(chain.problem["start"]) * n * (n + 3)))
-        z = nodes(q, 1 if q == 0 else min(self.nodes, max(room, _STAGE)))
+        count = 1 if q == 0 else min(self.nodes, max(room, _STAGE))
         if q == 0:
             limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
             limits |= _MIXED
         if chain.exact:
             limits["most"] = 1
+        found = self._learn(chain, model, first, start, drop, known, shaped, limits, count)
+        if int(found["code"]) == 2 and q and self.nodes > 1:
+            # A mode in the corner of its bounds may have no node inside them: then it stands alone.
+            found = self._learn(chain, model, first, start, drop, known, shaped, limits, 1)
+            found["code"] = max(int(found["code"]), 1)
+        return found
+
+    def _learn(
+        self, chain: Sites, model: Linear, first: Array, start: Start | None, drop: int, known: Known | None,
+        shaped: int, limits: dict[str, Any], count: int,
+    ) -> dict[str, Any]:  # fmt: skip
+        rate, learn_rate, beta = self._rate(model)
+        z = nodes(int(chain.free.sum()) + learn_rate, count)
         return dict(
             _core.ep_learn(
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
@@ -316,42 +339,36 @@ class Posterior:
         return float(self.outliers), False, (1.0, 1.0)
 
     def _estimate(self, chain: Sites, found: dict[str, Any], model: Linear, record: Record) -> Estimate:
-        nx = model.nx
-        code, residual = int(found["code"]), float(found["residual"])
-        status = _STATUS[code]
-        x, P, k3, k4 = found["x"], found["P"], found["k3"], found["k4"]
-        sound = code < 2 and bool(np.isfinite(x).all() and np.isfinite(P).all())
+        nx, residual, K = model.nx, found["residual"], found["nodes"]
+        sound = found["code"] < 2 and found["finite"]
         info: dict[str, Any] = {"notes": []}
-        s = np.where(chain.free, chain.guess, chain.floor)
-        value = np.where(chain.fitted, s**2, s)
-        widths = {"mean": value, "sd": np.zeros_like(s), "lo": value, "hi": value}
-        if sound:
-            widths = {name: found[name] for name in widths}
-            one = found["nodes"] == 1 and found["mode"].size > 0
-            few = code == 1 if one else found["nodes"] > 1 and found["effective"] < _FEW
-            status = Status.STALLED if residual > _USABLE else Status.REDUCED if residual > _FINE or few else Status.OK
         loglik: float | None = None
         if sound:
+            x, P = found["x"], found["P"]
+            widths = {name: found[name] for name in ("mean", "sd", "lo", "hi")}
             q = found["mode"].size
-            loglik = float(found["log_evidence"] - found["log_prior"] - 0.5 * q * math.log(2 * math.pi))
+            few = found["effective"] < _FEW if K > 1 else found["code"] == 1 and q > 0
+            status = Status.STALLED if residual > _USABLE else Status.REDUCED if residual > _FINE or few else Status.OK
+            loglik = found["log_evidence"] - found["log_prior"] - 0.5 * q * math.log(2 * math.pi)
         else:
-            status = Status.INFEASIBLE if code >= 2 else Status.STALLED
+            status = Status.INFEASIBLE if found["code"] >= 2 else Status.STALLED
+            s = np.where(chain.free, chain.guess, chain.floor)
+            value = np.where(chain.fitted, s**2, s)
+            widths = {"mean": value, "sd": np.zeros_like(s), "lo": value, "hi": value}
             x, P = self._fallback(chain, s)
-            k3 = k4 = np.zeros_like(x)
             info["hint"] = "wider half-widths, outliers=True, or missing outputs; BatchLP() names the rows in conflict"
             info["message"] = (
                 f"{status.value}, or the iteration ran away from it; "
                 "states are those of a Gaussian smoother with the same variances"
             )
-        k3, k4 = (np.where(np.isfinite(k), k, 0.0) for k in (k3, k4))
-        box = model.bounds if isinstance(model.bounds, Box) else None
-        within = None if box is None else (np.asarray(box.lo), np.asarray(box.hi))
-        if box is not None:
-            x = np.concatenate([x[:1], np.clip(x[1:], box.lo, box.hi)])
+        within = None
+        if isinstance(model.bounds, Box):
+            within = (np.asarray(model.bounds.lo), np.asarray(model.bounds.hi))
+            x[1:] = np.minimum(np.maximum(x[1:], within[0]), within[1])
         if (chain.exact and not chain.free.any()) or not sound:
-            spread: Any = Normal.of(x[1:].copy(), P[1:].copy(), within)
+            spread: Any = Normal.of(x[1:].copy(), P[1:], within)
         else:
-            spread = Shaped(x[1:].copy(), P[1:].copy(), k3[1:].copy(), k4[1:].copy(), within)
+            spread = Shaped(x[1:].copy(), P[1:], found["k3"][1:], found["k4"][1:], within)
         gamma = None
         if found["out"] is not None and not sound and model.loss is None:
             info |= {"outliers": [], "outlier_probability": np.where(record.seen, 0.0, np.nan)}
@@ -365,23 +382,21 @@ class Posterior:
                 info["outliers"] = _named(share, model, record)
                 info["outlier_probability"] = share
         p = nx + model.ny
-        has_q, has_r = chain.uniform[:nx].any(), chain.uniform[nx:p].any()
-        has_Q, has_R = chain.fitted[p : p + nx].any(), chain.fitted[p + nx :].any()
-        lost = (chain.uniform | chain.fitted) & (chain.floor < chain.cap) & (chain.count == 0)
-        if lost.any():
+        if not chain.count.all():
+            lost = (chain.uniform | chain.fitted) & (chain.floor < chain.cap) & (chain.count == 0)
             names = np.array([*model.names.x, *model.names.y])
             for what, part in (("bound", lost[:p]), ("variance", lost[p:])):
                 if part.any():
                     info["notes"].append(f"{what} not identifiable: " + ", ".join(names[part]))
-        if len(lost) > p:
+        if len(chain.count) > p:
             info["variances"] = {name: v[p:] for name, v in widths.items()}
         info |= {
             "x0": x[0].copy(),
             "half_widths": {name: v[:p] for name, v in widths.items()},
             "rate": found["rate"] if sound else None,
             "residual": residual,
-            "sweeps": int(found["sweeps"]),
-            "nodes": int(found["nodes"]),
+            "sweeps": found["sweeps"],
+            "nodes": K,
             "effective": found["effective"] if sound else 0.0,
         }
         return Estimate(
@@ -389,11 +404,11 @@ class Posterior:
             x[1:].copy(),
             spread,
             status,
-            typed(self),
-            q=widths["mean"][:nx].copy() if has_q and sound else None,
-            r=widths["mean"][nx:p].copy() if has_r and sound else None,
-            Q=widths["mean"][p : p + nx].copy() if has_Q and sound else None,
-            R=widths["mean"][p + nx :].copy() if has_R and sound else None,
+            _typed(self),
+            q=widths["mean"][:nx].copy() if sound and uniform_part(model.w) is not None else None,
+            r=widths["mean"][nx:p].copy() if sound and uniform_part(model.e) is not None else None,
+            Q=widths["mean"][p : p + nx].copy() if sound and chain.fitted[p : p + nx].any() else None,
+            R=widths["mean"][p + nx :].copy() if sound and chain.fitted[p + nx :].any() else None,
             gamma=gamma,
             loglik=loglik,
             names=model.names.x,
@@ -425,16 +440,20 @@ class Answer(NamedTuple):
     @property
     def start(self) -> Start:
         """Where the mode is, for the next evaluation of this chain or of one that begins some rows later."""
-        s = self.chain.floor.copy()
-        free = self.chain.free
-        s[free] = np.exp(self.found["mode"][: np.count_nonzero(free)])
-        before = (self.chain.problem["start"], *self.found["sites"])
+        s, free, found = self.chain.floor.copy(), self.chain.free, self.found
+        s[free] = np.exp(found["mode"][: np.count_nonzero(free)])
+        before = (self.chain.problem["start"], *found["sites"], *(found[name] for name in HANDED_ON))
         return Start(np.where(free, s, self.chain.cap), before)
 
     @property
     def told(self) -> Known:
         """What its rows tell of the half-widths."""
         return Known(self.found["told_pull"], self.found["told_precision"])
+
+
+@functools.lru_cache(maxsize=64)
+def _typed(method: Posterior) -> str:
+    return typed(method)
 
 
 def _named(share: Array, model: Linear, record: Record) -> list[dict[str, Any]]:

@@ -204,7 +204,7 @@ class Window:
             back = rows.back()
             done = slice(t - back, t + 1 if t == T - 1 else t - back + 1)  # the last window has nothing to wait for
             of_window = slice(done.start - t - 1, done.stop - t - 1 or None)
-            found.filtered[done] = np.array(rows.x)[of_window]
+            found.filtered[done] = rows.x[of_window]
             found.s[t], found.statuses[t] = solved.s, solved.status
             found.iterations[t] = solved.iterations
             if solved.variances is not None:

@@ -646,6 +646,8 @@ def _estimate_json(answer: Any, level: float, output: str | None) -> dict[str, A
         "hi": hi,
         "q": answer.q,
         "r": answer.r,
+        "Q": answer.Q,
+        "R": answer.R,
         "theta": answer.theta,
         "loglik": answer.loglik,
         "written": output,

@@ -96,7 +96,9 @@ class Bounded:
     nu: float | None = None
 
 
-def solve(drives: Sequence[Grid], settings: Bounded = Bounded()) -> list[Path]:
+def solve(
+    drives: Sequence[Grid], settings: Bounded = Bounded(), *, azimuth: Sequence[Floats] | None = None
+) -> list[Path]:
     """Solve the bounded chain for each drive.
 
     Parameters
@@ -104,13 +106,33 @@ def solve(drives: Sequence[Grid], settings: Bounded = Bounded()) -> list[Path]:
     drives : sequence of Grid
         Each with at least two nodes and one fix.
     settings : Bounded
+    azimuth : sequence of (T,) arrays, optional
+        Azimuths to linearise about first; `azimuth_of` each drive if absent.
 
     Returns
     -------
     list of Path
         Without variance; ``info`` has the half-widths and which of them sit on their floors.
     """
-    return [_solved(with_speed(drive), settings) for drive in drives]
+    azimuths = [None] * len(drives) if azimuth is None else list(azimuth)
+    return [_solved(with_speed(drive), settings, first) for drive, first in zip(drives, azimuths, strict=True)]
+
+
+def again(drives: Sequence[Grid], paths: Sequence[Path], settings: Bounded = Bounded()) -> list[Path]:
+    """Solve the bounded chain for drives of which fixes were hidden, once about the azimuths found with all fixes.
+
+    Parameters
+    ----------
+    drives : sequence of Grid
+    paths : sequence of Path
+        What `solve` found for each with all fixes.
+    settings : Bounded
+
+    Returns
+    -------
+    list of Path
+    """
+    return solve(drives, replace(settings, rounds=1), azimuth=[path.azimuth for path in paths])
 
 
 def nu_of(drive: Grid, settings: Bounded = Bounded()) -> float | None:
@@ -174,8 +196,8 @@ def stretches(drive: Grid, length: float, n: int, context: float) -> list[tuple[
     return found
 
 
-def _solved(drive: Grid, settings: Bounded) -> Path:
-    psi = azimuth_of(drive)
+def _solved(drive: Grid, settings: Bounded, azimuth: Floats | None = None) -> Path:
+    psi = azimuth_of(drive) if azimuth is None or not np.isfinite(azimuth).all() else azimuth
     y = np.column_stack((drive.east, drive.north))
     origin = y[int(np.argmax(drive.seen))].copy()
     y -= origin

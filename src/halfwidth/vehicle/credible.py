@@ -40,6 +40,12 @@ KINDS: tuple[str, ...] = (
     "along", "across", "azimuth", "", "", "offset_east", "offset_north", "drift_east", "drift_north",
 )  # fmt: skip
 
+#: Those of the states, then those of the fixes.
+_NAMES = (*KINDS, "fix_east", "fix_north")
+
+#: Rounds in which the Gaussian chain is solved again with hidden fixes, its scales kept.
+_AGAIN = 3
+
 ALONG, ACROSS, AZIMUTH, SCALE, BIAS, OFFSET_E, OFFSET_N, DRIFT_E, DRIFT_N = range(9)
 
 
@@ -81,16 +87,55 @@ def solve(drives: Sequence[Grid], settings: Credible = Credible()) -> list[Path]
     -------
     list of Path
         ``info`` has the half-widths with their standard deviations in units of the chain's, the Gaussian share, the
-        log evidence of each share, speed scale and yaw bias.
+        log evidence of each share, speed scale and yaw bias, and the fit of the Gaussian chain.
     """
     given = [with_speed(drive) for drive in drives]
     fits = chain.solve(given, settings.base)
     return [_solved(drive, fit, settings) for drive, fit in zip(given, fits, strict=True)]
 
 
+def again(drives: Sequence[Grid], paths: Sequence[Path], settings: Credible = Credible()) -> list[Path]:
+    """Return the posterior for drives of which fixes were hidden, with the half-widths that were learnt with all fixes.
+
+    Parameters
+    ----------
+    drives : sequence of Grid
+    paths : sequence of Path
+        What `solve` found for each with all fixes.
+    settings : Credible
+
+    Returns
+    -------
+    list of Path
+    """
+    given = [with_speed(drive) for drive in drives]
+    known = [path.info["chain"] for path in paths]
+    fits = chain.solve(
+        given,
+        replace(settings.base, rounds=_AGAIN),
+        sigma=np.array([fit.sigma for fit in known]),
+        azimuth=[fit.z[:, chain.AZIMUTH] for fit in known],
+        weight=[fit.weight for fit in known],
+        learn=False,
+    )
+    return [_again(drive, fit, path, settings) for drive, fit, path in zip(given, fits, paths, strict=True)]
+
+
+def _again(drive: Grid, fit: chain.Fit, path: Path, settings: Credible) -> Path:
+    if fit.path.status is Status.STALLED or "half_widths" not in path.info:
+        return fit.path
+    known = np.array([path.info["half_widths"].get(name, 0.0) for name in _NAMES])
+    share = path.info["gaussian_share"]
+    problem = _problem(drive, fit, fit.z[:, chain.AZIMUTH], share, settings, known)
+    answer = load("Posterior")(nodes=1).answer(problem.model, problem.record)
+    if not answer.estimate.status.good:
+        return fit.path
+    return problem.path(answer.estimate, fit, share, known, np.zeros(known.size))
+
+
 def _solved(drive: Grid, fit: chain.Fit, settings: Credible) -> Path:
     if fit.path.status is Status.STALLED:
-        return fit.path
+        return replace(fit.path, info={**fit.path.info, "chain": fit})
     quick = load("Posterior")(nodes=1)
     psi = fit.z[:, chain.AZIMUTH]
     tried = []
@@ -108,11 +153,12 @@ def _solved(drive: Grid, fit: chain.Fit, settings: Credible) -> Path:
             if not answer.estimate.status.good:
                 break
         if answer.estimate.status.good:
-            path = problem.path(answer.estimate, fit, share)
+            half = answer.estimate.info["half_widths"]
+            path = problem.path(answer.estimate, fit, share, half["mean"], half["sd"])
             evidence = {one[1]: one[0] for one in tried}
             return replace(path, info={**path.info, "evidence": evidence})
     words = "the posterior of partly bounded noise did not settle: the path of the Gaussian chain"
-    return replace(fit.path, status=Status.REDUCED, info={**fit.path.info, "notes": [words]})
+    return replace(fit.path, status=Status.REDUCED, info={**fit.path.info, "chain": fit, "notes": [words]})
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,17 +188,15 @@ class _Problem:
         """Return the azimuths (T,) of states z."""
         return z[:, AZIMUTH] * self.unit[:, AZIMUTH]
 
-    def path(self, est: Estimate, fit: chain.Fit, share: float) -> Path:
-        """Return an estimate as a path."""
+    def path(self, est: Estimate, fit: chain.Fit, share: float, half: Floats, sd: Floats) -> Path:
+        """Return an estimate as a path; half-widths (11,) with their standard deviations, in units of the chain's."""
         drive = self.drive
         place = np.einsum("tij,tj->ti", self.out, est.x) + self.origin
         variance = np.einsum("tij,tjk,tik->ti", self.out, np.asarray(est.P), self.out)
-        half = est.info["half_widths"]
         # the bounded part of a fix error: its expected square, half-widths integrated over
-        bounded = float(np.mean(half["mean"][-2:] ** 2 + half["sd"][-2:] ** 2)) / 3.0
+        bounded = float(np.mean(half[-2:] ** 2 + sd[-2:] ** 2)) / 3.0
         at_node = 0.5 * (drive.speed + np.concatenate((drive.speed[1:], drive.speed[-1:])))
         scale, bias = (est.x[:, k] * self.unit[:, k] for k in (SCALE, BIAS))
-        names = [*KINDS, "fix_east", "fix_north"]
         return Path(
             drive.t,
             place[:, 0],
@@ -163,9 +207,10 @@ class _Problem:
             (share**2 + bounded) * float(fit.sigma[chain.FIX]) ** 2,
             est.status,
             {
-                "half_widths": {n: float(m) for n, m in zip(names, half["mean"], strict=True) if n},
-                "half_width_sds": {n: float(m) for n, m in zip(names, half["sd"], strict=True) if n},
+                "half_widths": {n: float(m) for n, m in zip(_NAMES, half, strict=True) if n},
+                "half_width_sds": {n: float(m) for n, m in zip(_NAMES, sd, strict=True) if n},
                 "gaussian_share": share,
+                "chain": fit,
                 "sigma": fit.path.info["sigma"],
                 "slow_sd": fit.path.info["slow_sd"],
                 "speed_scale": float(np.mean(scale)),
@@ -174,8 +219,13 @@ class _Problem:
         )
 
 
-def _problem(drive: Grid, fit: chain.Fit, psi: Floats, share: float, settings: Credible) -> _Problem:
-    """Return the model of a drive about the azimuths psi, with this share of Gaussian noise."""
+def _problem(
+    drive: Grid, fit: chain.Fit, psi: Floats, share: float, settings: Credible, known: Floats | None = None
+) -> _Problem:
+    """Return the model of a drive about the azimuths psi, with this share of Gaussian noise.
+
+    Half-widths are sought, or `known` (11,), in units of the chain's scales.
+    """
     unit, extra, start = chain.learnt_noise(drive, fit, settings.base)
     h, vh, w = drive.h, drive.speed * drive.h, drive.yaw_rate
     T, n = h.size, len(KINDS)
@@ -221,8 +271,9 @@ def _problem(drive: Grid, fit: chain.Fit, psi: Floats, share: float, settings: C
         A * of[:, None, :] / unit[:, :, None],
         B / unit[:, :, None],
         out / fix,
-        Uniform.unknown(0.0, np.where(bounded, settings.most, 0.0)) + Gaussian(Q),
-        Uniform.unknown(0.0, settings.most) + Gaussian(np.full(2, share**2)),
+        (Uniform.unknown(0.0, np.where(bounded, settings.most, 0.0)) if known is None else Uniform(known[:n]))
+        + Gaussian(Q),
+        (Uniform.unknown(0.0, settings.most) if known is None else Uniform(known[n:])) + Gaussian(np.full(2, share**2)),
         Normal(first / unit[0], start / unit[0] ** 2),
         E=before * unit[:, None, :] / unit[:, :, None],
     )

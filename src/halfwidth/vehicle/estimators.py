@@ -70,6 +70,9 @@ class Method:
         Sensors it cannot do without: ``"speed"``, ``"yaw_rate"``.
     one_of : tuple of str
         Sensors of which it needs one.
+    again : function (drives, paths, tuned) -> list of Path, optional
+        Fills the same drives with fixes hidden, with what their paths with all fixes have learnt; `run`, which learns
+        again, if absent.
     run : function (drives, tuned) -> list of Path
     tune : function (drive) -> mapping
         What it learns from the whole log, once.
@@ -82,6 +85,7 @@ class Method:
     run: Callable[[Sequence[Grid], Tuned], list[Path]]
     tune: Callable[[Grid], Tuned] = lambda drive: _NOTHING  # noqa: ARG005
     one_of: tuple[str, ...] = ()
+    again: Callable[[Sequence[Grid], Sequence[Path], Tuned], list[Path]] | None = None
 
     def lacks(self, drive: Grid) -> str | None:
         """Return in words the sensor that the drive does not have, or None."""
@@ -389,16 +393,16 @@ def _bounded(settings: bounded.Bounded) -> Callable[[Sequence[Grid], Tuned], lis
     return lambda drives, tuned: bounded.solve(drives, settings)  # noqa: ARG005
 
 
-def _credible(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:  # noqa: ARG001
-    return credible.solve(drives)
+def _bounded_again(settings: bounded.Bounded) -> Callable[[Sequence[Grid], Sequence[Path], Tuned], list[Path]]:
+    return lambda drives, paths, tuned: bounded.again(drives, paths, settings)  # noqa: ARG005
 
 
-def _worst_share(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
-    return bounded.solve(drives, bounded.Bounded(slow=False, nu=tuned["nu"] or None))
+def _worst_share(tuned: Tuned) -> bounded.Bounded:
+    return bounded.Bounded(slow=False, nu=tuned["nu"] or None)
 
 
-def _tube(drives: Sequence[Grid], tuned: Tuned) -> list[Path]:
-    return tube.solve(drives, tube.Tube(inflation=tuned["inflation"]))
+def _tube(tuned: Tuned) -> tube.Tube:
+    return tube.Tube(inflation=tuned["inflation"])
 
 
 #: What the chain may take the error of a fix for; the first is the usual one.
@@ -427,9 +431,25 @@ METHODS: Mapping[str, Method] = MappingProxyType(
                 )
                 for name, words in (("em", ""), ("em-slow", ", slow fix error"), ("em-white", ", white fix error"))
             ),
-            Method("ep", "posterior of the chain, noise partly bounded", 60.0, (), _credible, one_of=_SENSORS),
+            Method(
+                "ep",
+                "posterior of the chain, noise partly bounded",
+                60.0,
+                (),
+                lambda drives, tuned: credible.solve(drives),  # noqa: ARG005
+                one_of=_SENSORS,
+                again=lambda drives, paths, tuned: credible.again(drives, paths),  # noqa: ARG005
+            ),
             *(
-                Method(name, f"chain with bounded noise{words}", 20.0, (), _bounded(settings), one_of=_SENSORS)
+                Method(
+                    name,
+                    f"chain with bounded noise{words}",
+                    20.0,
+                    (),
+                    _bounded(settings),
+                    one_of=_SENSORS,
+                    again=_bounded_again(settings),
+                )
                 for name, words, settings in (
                     ("slp", "", bounded.Bounded()),
                     ("slp-white", ", no fix offset", bounded.Bounded(slow=False)),
@@ -441,18 +461,20 @@ METHODS: Mapping[str, Method] = MappingProxyType(
                 "chain with bounded noise, mean of the worst rows",
                 20.0,
                 (),
-                _worst_share,
+                lambda drives, tuned: bounded.solve(drives, _worst_share(tuned)),
                 lambda drive: {"nu": bounded.nu_of(drive, bounded.Bounded(slow=False)) or 0.0},
                 one_of=_SENSORS,
+                again=lambda drives, paths, tuned: bounded.again(drives, paths, _worst_share(tuned)),
             ),
             Method(
                 "tube",
                 "centre of the tube of bounded noise",
                 20.0,
                 (),
-                _tube,
+                lambda drives, tuned: tube.solve(drives, _tube(tuned)),
                 lambda drive: {"inflation": tube.inflation_of(drive)},
                 one_of=_SENSORS,
+                again=lambda drives, paths, tuned: tube.again(drives, paths, _tube(tuned)),
             ),
             Method(
                 "paper000",

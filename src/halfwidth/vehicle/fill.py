@@ -580,16 +580,23 @@ def _end_tests(
 def _nearest(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, length: float) -> str:
     """Return which way came nearest to hidden fixes, and was surest, in stretches about as long as this.
 
-    Another way than the usual one has to be clearly better.
+    Another way than the usual one has to be clearly better. Where the sensors speak, it has to be so in the stretches
+    of all lengths together, too: what fixes are wrong by is the same in all, and a few long ones are soon luck.
     """
-    if not tests:
-        return usual
+    size = {name: {one.length_s: one.mean_m * one.half_m for one in row} for name, row in tests.items()}
+    if usual not in size:
+        return min(size, key=lambda name: min(size[name].values()), default=usual)
 
-    def loss(name: str) -> float:
-        one = min(tests[name], key=lambda one: abs(np.log(one.length_s / max(length, 1e-3))))
-        return one.mean_m * one.half_m / (1.0 if name == usual else _BETTER)
+    def share(name: str) -> float:
+        common = [(at, own / max(size[usual][at], 1e-12)) for at, own in size[name].items() if at in size[usual]]
+        if not common:
+            return np.inf
+        near = min(common, key=lambda one: abs(np.log(one[0] / max(length, 1e-3))))[1]
+        guessed = any(one.guessed for one in tests[name])
+        return near if guessed else max(near, float(np.exp(np.mean(np.log([max(r, 1e-12) for _, r in common])))))
 
-    return min(tests, key=loss)
+    best = min((name for name in size if name != usual), key=share, default=usual)
+    return best if best != usual and share(best) < _BETTER else usual
 
 
 def _pauses(grid: Grid) -> list[tuple[float, float]]:
@@ -715,14 +722,21 @@ def _stray(path: Path, grid: Grid) -> NDArray[np.bool_]:
 def _plain(
     chosen: Method, grids: Sequence[Grid], able: Sequence[int]
 ) -> tuple[dict[int, Path], Rerun, dict[str, object]]:
-    """Run a method that learns from the longest piece."""
+    """Run a method that learns from the longest piece, and from each piece with all its fixes what it keeps of it."""
     tuned = chosen.tune(grids[max(able, key=lambda i: len(grids[i]))]) if able else {}
 
-    def rerun(which: Sequence[int], hidden: Sequence[Grid], afresh: bool) -> list[Path]:  # noqa: ARG001
-        return [sized(p, g) for p, g in zip(chosen.run(hidden, tuned), hidden, strict=True)]
+    whole: dict[int, Path] = {}
 
+    def rerun(which: Sequence[int], hidden: Sequence[Grid], afresh: bool) -> list[Path]:
+        if afresh or chosen.again is None:
+            paths = chosen.run(hidden, tuned)
+        else:
+            paths = chosen.again(hidden, [whole[i] for i in which], tuned)
+        return [sized(path, grid) for path, grid in zip(paths, hidden, strict=True)]
+
+    whole.update(zip(able, rerun(able, [grids[i] for i in able], True), strict=True))
     settings: dict[str, object] = {f"{_words(name)} noise": float(f"{value:.3g}") for name, value in tuned.items()}
-    return dict(zip(able, rerun(able, [grids[i] for i in able], True), strict=True)), rerun, settings
+    return whole, rerun, settings
 
 
 def _spare(grid: Grid, chosen: Method) -> Path:

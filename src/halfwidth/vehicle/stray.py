@@ -54,9 +54,12 @@ _CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 1.6, 2.
 #: Scale of what the calibration takes to be without noise.
 _NO_NOISE = 1e-4
 
+#: Fixes that follow wrong ones for so long, away from the gap, are what the other side of the gap is compared with, s.
+_FOLLOW = 8.0
+
 #: How much of the drive on each side of a gap tells wrong fixes from a jump, s; the chain that is asked; how far wrong
-#: fixes may be off, m; and with how many numbers an axis.
-_SIDE, _JUDGE, _WIDE, _SHAPE = 60.0, chain.Chain(rounds=16), 10.0, 3
+#: fixes may be off, m, and with how many numbers an axis; the logarithm of the odds against them: one gap in ten.
+_SIDE, _JUDGE, _WIDE, _SHAPE, _RARE = 60.0, chain.Chain(rounds=16), 10.0, 3, 2.2
 
 #: Scale and bias are known to this many of their standard deviations, and no better than this.
 _KNOWN, _SCALE, _BIAS = 3.0, 0.003, 0.001
@@ -250,9 +253,9 @@ class _Search:
 
         The chain that knows such jumps learns from the drive around the gap as it is, and from the same with the
         doubtful fixes put back by as much as they are off: by a constant, a trend and a bend, as far as they are
-        enough. The likelihood must grow by more than what these numbers are worth: each the logarithm of how little of
-        `_WIDE` is left for it. Next to fixes that are wrong it need only grow. In the middle of fixes both sides were
-        asked before.
+        enough. The likelihood must grow by more than what these numbers are worth, each the logarithm of how little of
+        `_WIDE` is left for it, and by how rare wrong fixes are. Next to some that are wrong it need only grow. What the
+        other side of the gap says against it counts as well. In the middle of fixes both sides were asked before.
         """
         asked = [doubt for doubt in found if doubt.before != doubt.after]
         parts = [self._around(doubt, found[doubt].nodes) for doubt in asked]
@@ -261,16 +264,50 @@ class _Search:
         hidden = [drive.masked(np.isin(np.arange(len(drive)), k)) for drive, k in zip(here, own, strict=True)]
         without = chain.solve(hidden, _JUDGE) if asked else []
         moved = [_put_back(drive, k, fit.path) for drive, k, fit in zip(here, own, without, strict=True)]
-        fits = chain.solve([*here, *moved], _JUDGE) if asked else []
-        gain = [_likely(fit, drive) for fit, drive in zip(fits, [*here, *moved], strict=True)]
+        gain = _likely([*here, *moved]) if asked else []
+        against = self._against(asked, [found[doubt].nodes for doubt in asked])
         better = dict(found)
         for i, (doubt, k, fit) in enumerate(zip(asked, own, without, strict=True)):
-            numbers = 0 if doubt.known else 2 * min(k.size, _SHAPE)
             spread = fit.path.variance
             left = np.nan if spread is None else float(np.sqrt(np.median(spread[k])))
-            if gain[len(asked) + i] - gain[i] < numbers * max(np.log(_WIDE / left), 0.0):
+            worth = _RARE + 2 * min(k.size, _SHAPE) * max(np.log(_WIDE / left), 0.0)
+            if gain[len(asked) + i] - gain[i] - against[i] < (0.0 if doubt.known else worth):
                 del better[doubt]
         return better
+
+    def _against(self, doubts: Sequence[_Doubt], wrong: Sequence[NDArray[np.intp]]) -> list[float]:
+        """Return by how much the other side of each gap, alone, comes nearer to the doubtful fixes than to those that
+        follow, as a logarithm of likelihoods, 0 if it does not.
+
+        Both are off by what reckoning through the gap is, so the two distances share one deviation.
+        """
+        t = self.grid.t[self.seen]
+        parts, sides, hidden = [], [], []
+        for doubt, nodes in zip(doubts, wrong, strict=True):
+            first, stop = doubt.block
+            at = np.searchsorted(self.seen, nodes)
+            mask = self.gone.copy()
+            if doubt.backwards:
+                begin = max(first, int(np.searchsorted(t, t[at[0]] - _FOLLOW)))
+                end = int(np.searchsorted(t, t[min(stop, t.size - 1)] + _SIDE))
+                following = self.seen[begin : at[0]]
+                mask[self.seen[:stop]] = True
+            else:
+                begin = int(np.searchsorted(t, t[max(first - 1, 0)] - _SIDE))
+                end = min(stop, int(np.searchsorted(t, t[at[-1]] + _FOLLOW)))
+                following = self.seen[at[-1] + 1 : end]
+                mask[self.seen[first:]] = True
+            part = slice(int(self.seen[begin]), int(self.seen[end - 1]) + 1)
+            parts.append(part)
+            sides.append((nodes, following[~self.gone[following]]))
+            hidden.append(self.grid.rows(part).masked(mask[part]))
+        able = [i for i, drive in enumerate(hidden) if sides[i][1].size and drive.seen.any()]
+        fits = chain.solve([hidden[i] for i in able], self.settings, sigma=self.noise, learn=False) if able else []
+        found = [0.0] * len(hidden)
+        for i, fit in zip(able, fits, strict=True):
+            (own, sd), (other, _) = (np.median(_off(self.grid, nodes, parts[i], fit), axis=1) for nodes in sides[i])
+            found[i] = max(0.0, 0.5 * float(other**2 - own**2) / float(sd) ** 2)
+        return found
 
     def _around(self, doubt: _Doubt, nodes: NDArray[np.intp]) -> slice:
         """Return the nodes around a gap with doubtful fixes at one of its ends."""
@@ -319,14 +356,26 @@ def _put_back(drive: Grid, own: NDArray[np.intp], path: Path) -> Grid:
     return replace(drive, east=east, north=north)
 
 
-def _likely(fit: chain.Fit, drive: Grid) -> float:
-    """Return the log-likelihood of the fixes of a drive, with Student's distribution of the increments of the offset.
+def _likely(drives: Sequence[Grid]) -> list[float]:
+    """Return the log-likelihood of the fixes of drives under a chain whose offset jumps, but not inside gaps.
 
-    To that given their weights w comes what the weights cost, (tail / 2) (log w - w + 1) each: with the best weight
-    it is the logarithm of Student's density, but for a constant.
+    The scales and the weights w of the increments of the offset are learnt first. To the likelihood given the weights
+    comes what they cost, (tail / 2) (log w - w + 1) each: with the best weight it is the logarithm of Student's density
+    but for a constant. In a gap nothing tells a jump, and what is a fault would hide in one there.
     """
-    weight = fit.weight[1:][~chain.in_gap(drive)[1:]]
-    return fit.loglik + 0.5 * _JUDGE.tail * float(np.sum(np.log(weight) - weight + 1.0))
+    learnt = chain.solve(drives, _JUDGE)
+    gaps = [chain.in_gap(drive) for drive in drives]
+    weights = [np.where(gap, 1.0, fit.weight) for gap, fit in zip(gaps, learnt, strict=True)]
+    fits = chain.solve(
+        drives,
+        replace(_JUDGE, tail=np.inf, rounds=2),
+        sigma=np.array([fit.sigma for fit in learnt]),
+        azimuth=[fit.z[:, chain.AZIMUTH] for fit in learnt],
+        weight=weights,
+        learn=False,
+    )
+    costs = [0.5 * _JUDGE.tail * float(np.sum(np.log(w[1:]) - w[1:] + 1.0)) for w in weights]
+    return [fit.loglik + cost for fit, cost in zip(fits, costs, strict=True)]
 
 
 def _most(answer: _Answer) -> float:

@@ -83,6 +83,37 @@ def solve(drives: Sequence[Grid], settings: Tube = Tube()) -> list[Path]:
     return [_solved(with_speed(drive), settings) for drive in drives]
 
 
+def again(drives: Sequence[Grid], paths: Sequence[Path], settings: Tube = Tube()) -> list[Path]:
+    """Return the centre of the tube for drives of which fixes were hidden, with what was learnt with all fixes.
+
+    The half-widths, the azimuths to linearise about and, within each step of the tube, the shape of the path are those
+    of the paths given; the nodes of the tube are new.
+
+    Parameters
+    ----------
+    drives : sequence of Grid
+    paths : sequence of Path
+        What `solve` found for each with all fixes.
+    settings : Tube
+
+    Returns
+    -------
+    list of Path
+    """
+    both = zip(drives, paths, strict=True)
+    return [_again(with_speed(drive), path, settings) for drive, path in both]
+
+
+def _again(drive: Grid, path: Path, settings: Tube) -> Path:
+    if "inflation" not in path.info or path.variance is None:
+        return _solved(drive, settings)
+    left_out = path.info.get("left_out", ())
+    kept = _apart(drive.masked(np.isin(drive.t, [t for t, _ in left_out])), settings.step)
+    rough = _coarse(drive, kept)
+    found = replace(path, azimuth=path.azimuth[kept], info={**path.info, "left_out": left_out})
+    return _centred(drive, path, rough, kept, found, replace(settings, inflation=path.info["inflation"]))
+
+
 def inflation_of(drive: Grid, settings: Tube = Tube()) -> float:
     """Return the least inflation with which the tube holds nine of ten hidden fixes of a drive; the largest if none.
 
@@ -137,10 +168,15 @@ def _solved(drive: Grid, settings: Tube) -> Path:
     found = bounded.solve([rough], settings.base)[0]
     if found.status is Status.STALLED or fine.status is Status.STALLED or "half_widths" not in found.info:
         return fine
+    return _centred(drive, fine, rough, kept, found, settings)
+
+
+def _centred(drive: Grid, fine: Path, rough: Grid, kept: NDArray[np.intp], found: Path, settings: Tube) -> Path:
+    """Return a fine path moved to the centre of the tube of half-widths that were found on some of its nodes."""
     half_widths = found.info["half_widths"]
     band, inflation = _band(rough, found, settings)
     info = {**found.info, "notes": list(fine.info.get("notes", ())), "inflation": inflation}
-    info["left_out"] = fine.info.get("left_out", ())
+    info["left_out"] = tuple(dict.fromkeys((*fine.info.get("left_out", ()), *found.info.get("left_out", ()))))
     if band is None:
         words = "no path fits the learnt half-widths, inflated: the path of the bounded chain"
         return replace(fine, status=Status.REDUCED, info={**info, "notes": [*info["notes"], words]})
