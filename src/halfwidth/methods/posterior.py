@@ -65,8 +65,8 @@ _LIMITS = {
 _LONG = 2000
 _FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
-#: A window takes over the mode of the one before at most so often in a row and in an eighth of its rows: not at all, since
-#: stages of nodes about an old mode were found to lose what a stream knows. Sites are taken over in any case.
+#: A window takes over the mode of the one before at most so often in a row and in an eighth of its rows: not at all,
+#: since stages of nodes about an old mode were found to lose what a stream knows. Sites are taken over in any case.
 _AGAIN = 0
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
