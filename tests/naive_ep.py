@@ -6,6 +6,8 @@ import math
 import numpy as np
 from tests import naive_noise
 
+_NODE, _WEIGHT = np.polynomial.legendre.leggauss(200)
+
 
 def rows_of(problem, s):
     """Return dense rows a, offsets b, (kind, parameters) and stage of every factor on a'X - b, x0 first."""
@@ -89,10 +91,9 @@ def cumulants(kind, parameter, mu, c):
     """Return the third and fourth cumulant of N(mu, c) within a factor's ends."""
     lo, hi = (-parameter, parameter) if kind == "box" else parameter
     sd = math.sqrt(c)
-    z, weight = np.polynomial.legendre.leggauss(400)
     lo, hi = max(lo, mu - 12 * sd), min(hi, mu + 12 * sd)
-    z = 0.5 * (lo + hi) + 0.5 * (hi - lo) * z
-    p = weight * np.exp(-0.5 * ((z - mu) ** 2 - ((z - mu) ** 2).min()) / c)
+    z = 0.5 * (lo + hi) + 0.5 * (hi - lo) * _NODE
+    p = _WEIGHT * np.exp(-0.5 * ((z - mu) ** 2 - ((z - mu) ** 2).min()) / c)
     p /= p.sum()
     d = z - p @ z
     return p @ d**3, p @ d**4 - 3 * (p @ d**2) ** 2
