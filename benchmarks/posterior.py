@@ -323,7 +323,7 @@ def variances():
 def priors():
     """Print coverage and bias for other powers of the prior."""
     kept = posterior.POWER
-    for power in (0.4, 0.6, 0.8):
+    for power in (0.25, 0.5, 0.75):
         posterior.POWER = power
         for delta in (5, 25, 50):
             show(f"power {power}, Delta {delta}", one_case(delta, count=min(WINDOWS, 200)))

@@ -86,7 +86,7 @@ struct EpLearner {
                                : a.beta_a * phi[j] - (a.beta_a + a.beta_b) * std::log1p(std::exp(phi[j]));
         return p;
     }
-    // the slope of the rest; that of `log_told` is measured between lanes
+    // the slope of the rest
     double prior_slope(int j, const double* phi) const {
         return group[j] >= 0 ? a.power - a.warp + known_slope(j, phi)
                              : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi[j]));
@@ -412,9 +412,9 @@ struct EpLearner {
             for (int i = 0; i < q; i++) column[j][i] = known_curve(i, j, phi);
             column[j][j] += max2(group[j] >= 0 ? 0.3 * a.count[group[j]] : 1.0, a.least);
         }
-        // d log_told / d phi; until it is measured: told grows with s^2 / (s^2 + what blurs it), so d log told / d log s
-        // = 2 (1 - told), whose own slope is near enough for a Hessian
-        double drift[ep_free] = {};
+        // Of told only its own half-width's slope is climbed: it grows with s^2 / (s^2 + what blurs it), so d log told / d log s
+        // = 2 (1 - told). What it loses to the others would lead to modes of next to no noise, far from where the mass is.
+        double kept_value = minus_inf;  // without told
         int next = 0, missing = q;
         *best = minus_inf;
         double d[ep_free] = {}, trial[ep_free];
@@ -440,7 +440,9 @@ struct EpLearner {
             if (begin == led) recall(at);
             else ep.start();
             evaluate_inside(at, begin == afresh ? a.many : a.few, 0.3 * a.tol, value, slope, begin, *best == minus_inf);
-            if (!(value[0] > *best - 0.05 * q) && refused < 6) {  // too far, or no trajectory fits
+            double may = 0.05 * q;
+            for (int j = 0; j < q; j++) may += 2.0 * a.reference * std::fabs(d[j]);
+            if (!(value[0] - log_told(0) > kept_value - may) && refused < 6) {  // too far, or no trajectory fits
                 refused++;
                 if (*best == minus_inf) {  // the start itself: wider half-widths fit more
                     for (int j = 0; j < q; j++) phi[j] = min2(max2(phi[j] + (group[j] >= 0 ? 0.7 : 0.0), lo[j]), hi[j]);
@@ -455,10 +457,11 @@ struct EpLearner {
             if (value[0] == minus_inf) return 2;
             refused = 0;
             *best = value[0];
+            kept_value = value[0] - log_told(0);
             *a.log_prior = log_prior(trial, 0);
             for (int j = 0; j < q; j++) {
                 phi[j] = trial[j];
-                if (!measured[j] && group[j] >= 0) drift[j] = 2.0 * a.reference * (1.0 - told(j, 0));
+                g[j] = slope[0][j] + (group[j] >= 0 ? 2.0 * a.reference * (1.0 - told(j, 0)) : 0.0);
             }
             for (int l = 1; l < wide_lanes; l++)
                 if (along[l] >= 0 && value[l] > minus_inf) {
@@ -466,14 +469,12 @@ struct EpLearner {
                         const double saturates = group[i] >= 0 ? 2.0 * a.reference * (told(i, l) - told(i, 0)) : 0.0;
                         column[along[l]][i] = -(slope[l][i] - slope[0][i] - saturates) / h[l];
                     }
-                    drift[along[l]] = (log_told(l) - log_told(0)) / h[l];
                     // an unmeasured column mirrors a measured one
                     for (int i = 0; i < q; i++)
                         if (!measured[i] && i != along[l]) column[i][along[l]] = column[along[l]][i];
                     if (!measured[along[l]]) missing--;
                     measured[along[l]] = true;
                 }
-            for (int j = 0; j < q; j++) g[j] = slope[0][j] + drift[j];
             remember(0, phi);
             follow(along, h, value);
             hessian(column, H);

@@ -184,15 +184,17 @@ def test_nodes_that_are_taken_over_are_as_good_as_fresh_ones():
     _, record = drawn(40, 11)
     model = system(UNKNOWN, UNKNOWN, bounds=BOX)
     known = Known(300.0 * np.sqrt(TRUE), 300.0 * np.eye(5))  # of rows before
-    start = None
+    start, since = None, []
     for first in range(6):
         part = hw.Record(record.t[first : first + 25], record.y[first : first + 25])
         answer = hw.Posterior(nodes=20).answer(model, part, start=start, drop=1, known=known)
         found, start = answer.found, answer.start
+        since.append(found["since"])
         sound = np.isfinite(found["log_weight"])
         s = np.exp(found["phi"][sound])
         fresh = _core.ep_run(answer.chain.problem, s, np.zeros(len(s)), 200, 1e-9, 1.0, None)
         np.testing.assert_allclose(found["slope"][sound], fresh["slope"][:, :5], atol=0.1)
+    assert 1 in since
 
 
 @pytest.mark.parametrize("memory", [6, 18])

@@ -37,7 +37,7 @@ def test_mode_without_a_prior_is_maximum_likelihood(seed):
     _, record = drawn(120, seed)
     chain = sites(asked(), record)
     z = posterior.nodes(4, 1)
-    limits = posterior._LIMITS | {"condition": 0.0, "close": 1e-10, "steps": 60, "reference": 0.0}
+    limits = posterior._LIMITS | {"condition": 0.0, "close": 1e-10, "steps": 60, "reference": 0.0, "again": 0}
     found = _core.ep_learn(
         chain.problem, chain.free, chain.floor, chain.cap, chain.scale, chain.guess, chain.count, chain.fitted, False, 0.0,
         -14.0, posterior.WARP, 1.0, 1.0, z, limits,

@@ -48,7 +48,7 @@ from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box, Normal, Shaped
 
 #: Power of the half-widths' prior; see above.
-POWER = 0.6
+POWER = 0.5
 #: Nodes of a stage, and most stages (core/ep_learn.hpp).
 _STAGE, _STAGES = 16, 8
 #: Numbers that the beliefs of all nodes may take up; one stage is always had.
@@ -65,9 +65,8 @@ _LIMITS = {
 _LONG = 2000
 _FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
-#: A window takes over the mode of the one before at most so often in a row and in an eighth of its rows: not at all,
-#: since stages of nodes about an old mode were found to lose what a stream knows. Sites are taken over in any case.
-_AGAIN = 0
+#: A window takes over the mode and the nodes of the one before, at most so often in a row and in an eighth of its rows.
+_AGAIN = 4
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
