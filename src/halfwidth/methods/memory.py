@@ -252,7 +252,8 @@ def _at_nodes(chain: Sites, answer: Answer) -> tuple[Array, Array]:
     eps = 1.0 / (1.0 + np.exp(-phi[:, -1])) if phi.shape[1] > free.size else np.full(len(phi), answer.rate)
     run = _core.ep_run(chain.problem, s, eps, _SWEEPS, _CLOSE, _DAMPING, None)
     told = np.clip(run["learned"][:, free] / np.maximum(chain.count[free], 1.0), 1e-12, 1.0)
-    return run["log_z"] + run["second"], 0.5 * np.log(told).sum(axis=1)
+    second = np.where(np.isfinite(run["second"]), run["second"], 0.0)  # as the core takes it
+    return run["log_z"] + second, 0.5 * np.log(told).sum(axis=1)
 
 
 def _foretold(window: Window, model: Linear, record: Record) -> tuple[Array, Array]:
