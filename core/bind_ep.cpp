@@ -207,6 +207,7 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
     found["k4"] = fresh({members, stages, n}, &a.k4);
     found["log_z"] = fresh({members}, &a.log_z);
     found["slope"] = fresh({members, static_cast<std::size_t>(a.groups) + 1}, &a.slope);
+    found["second"] = fresh({members}, &a.more);
     found["learned"] = fresh({members, static_cast<std::size_t>(a.groups)}, &a.learned);
     found["residual"] = fresh({members}, &a.residual);
     found["worst"] = fresh({members}, &a.worst);
@@ -227,10 +228,11 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
 }
 
 nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale, In start, In count,
-               InBool squared, bool learn_eps, double rate, double start_eps, double power, double beta_a, double beta_b, In z, In log_proposal,
+               InBool squared, bool learn_eps, double rate, double start_eps, double power, double beta_a, double beta_b, In z,
                const nb::dict& limits, std::optional<nb::tuple> before, int drop, int shaped, std::optional<In> pull,
                std::optional<In> precision, std::optional<nb::dict> outside) {
-    constexpr std::size_t abreast = hw::ep_abreast;
+    want(z.ndim() == 2 && z.shape(0) >= 1, "z (nodes, q)");
+    const std::size_t nodes = z.shape(0), abreast = (nodes + hw::ep_abreast - 1) / hw::ep_abreast * hw::ep_abreast;
     Problem p(problem, abreast);
     std::optional<Problem> bounds;
     if (outside) bounds.emplace(*outside, abreast);
@@ -242,8 +244,7 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     std::size_t q = learn_eps ? 1 : 0;
     for (std::size_t g = 0; g < groups; g++) q += free.data()[g] ? 1 : 0;
     want(q <= std::size_t(hw::ep_free), "at most 16 free parameters");
-    const std::size_t nodes = log_proposal.size();
-    want(nodes >= 1 && z.size() == nodes * q, "z (nodes, q), log_proposal (nodes,)");
+    want(z.shape(1) == q, "z (nodes, q)");
     l.free = free.data();
     l.squared = squared.data();
     l.floor = floor.data();
@@ -264,7 +265,6 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     l.beta_a = beta_a;
     l.beta_b = beta_b;
     l.z = z.data();
-    l.log_proposal = log_proposal.data();
     l.nodes = static_cast<int>(nodes);
     const auto whole = [&](const char* name) { return nb::cast<int>(limits[name]); };
     const auto real = [&](const char* name) { return nb::cast<double>(limits[name]); };
@@ -277,6 +277,9 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     l.close = real("close");
     l.near = real("near");
     l.least = real("least");
+    l.stage = whole("stage");
+    l.enough = real("enough");
+    l.usable = real("usable");
     l.narrow = real("narrow");
     l.warp = real("warp");
     l.reference = real("reference");
@@ -348,6 +351,11 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     found["phi"] = fresh({nodes, q}, &l.phi);
     found["log_weight"] = fresh({nodes}, &l.log_weight);
     found["slope"] = fresh({nodes, q}, &l.node_slope);
+    found["second"] = fresh({nodes}, &l.second);
+    std::vector<double> of_nodes(3 * nodes);
+    l.value = of_nodes.data();
+    l.share = l.value + nodes;
+    l.residuals = l.share + nodes;
     found["x"] = fresh({stages, n}, &l.x);
     found["P"] = fresh({stages, n, n}, &l.P);
     found["k3"] = fresh({stages, n}, &l.k3);
@@ -420,7 +428,7 @@ void bind_ep(nb::module_& mod) {
             "What is known of the free half-widths alone, whatever the others are; see core/ep_handover.hpp.");
     mod.def("ep_learn", &learn, "problem"_a, "free"_a, "floor"_a, "cap"_a, "scale"_a, "start"_a, "count"_a,
             "squared"_a, "learn_eps"_a,
-            "rate"_a, "start_eps"_a, "power"_a, "beta_a"_a, "beta_b"_a, "z"_a, "log_proposal"_a, "limits"_a,
+            "rate"_a, "start_eps"_a, "power"_a, "beta_a"_a, "beta_b"_a, "z"_a, "limits"_a,
             "before"_a.none() = nb::none(), "drop"_a = 0, "shaped"_a = 0, "pull"_a.none() = nb::none(), "precision"_a.none() = nb::none(),
             "outside"_a.none() = nb::none(),
             "The same with half-widths found by evidence and what is not known of them carried into the answer.");

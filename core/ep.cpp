@@ -9,7 +9,7 @@ namespace {
 
 std::size_t block_size(const EpArgs& a) {
     const std::size_t stages = a.T + 1, n = a.n;
-    const std::size_t shape = a.k3 ? stages * (5 * n * n + 2 * n) + 2 * std::size_t(a.rows) : 0;
+    const std::size_t shape = a.k3 ? stages * (6 * n * n + 2 * n) + 2 * std::size_t(a.rows) : 0;
     return stages * (2 * n + n * (n + 1)) + stages * 2 * n + 2 * std::size_t(a.rows) + 4 * std::size_t(a.groups) + 4 + shape;
 }
 
@@ -46,6 +46,7 @@ void settle_in(Ep<N>& ep, EpFound& f, Place& place) {
     c.B = place.take(square);
     c.X0 = place.take(square);
     c.X1 = place.take(square);
+    c.W = place.take(square);
     c.w3 = place.take(stages * n);
     c.w4 = place.take(stages * n);
     c.r3 = place.take(a.rows);
@@ -88,9 +89,11 @@ int run(N n, const EpArgs& a) {
         ep.cross = wanted;
         ep.look(f);
         if (a.k3) ep.shapes(a.k3, a.k4);
+        const V more = a.k3 && a.more ? ep.second() : V(0.0);
         for (int l = 0; l < wide_lanes && first + l < a.members; l++) {
             const std::ptrdiff_t k = first + l;
             a.log_z[k] = ep.sound(f, l) ? f.log_z[l] : minus_inf;
+            if (a.more) a.more[k] = more[l];
             a.residual[k] = f.residual[l];
             a.worst[k] = f.worst[l];
             for (int g = 0; g < a.groups; g++) a.learned[k * a.groups + g] = f.learned[g][l];

@@ -41,7 +41,7 @@ inline V root(const V& a) { return V::of(sqrt4(a.v)); }
 inline V log_of(const V& a) { return V::of(log4(a.v)); }
 inline V either(decltype(X{} < X{}) test, const V& a, const V& b) { return V::of(test ? a.v : b.v); }
 
-constexpr int shape_reach = 4;
+constexpr int shape_reach = 4;  // rows over which factors that are not Gaussian act together
 
 // sizes of local arrays
 template <class N>
@@ -152,6 +152,7 @@ struct EpCross {
     V *S, *Pf;  // (T+1, n, n): covariance of x_t given all, and given what lies up to t
     V *B;       // (T+1, n, n): covariance of x_{t-1} with x_t
     V *X0, *X1; // (T+1, n, n): covariance of x_{t-1} and of x_t with w_t
+    V *W;       // (T+1, n, n): covariance of w_t
     V *w3, *w4; // (T+1, n): cumulants of the sites of w over the variance's powers 3 and 4
     V *r3, *r4; // (rows,): of the rows
 };
@@ -172,7 +173,7 @@ struct Ep {
     bool mixed = false;  // rows with two explanations
 
     // whether a shape that is asked for needs the cumulants of stage t
-    inline bool bent(int t) const { return cross.S && t >= shaped - shape_reach; }
+    inline bool bent(int) const { return cross.S; }  // `second` asks for all
     inline int packed() const { return n * (n + 1) / 2; }
     inline void unpack(const V* p, V* M) const {
         for (int i = 0; i < n; i++)
@@ -710,7 +711,7 @@ struct Ep {
 
     // covariances of x_{t-1}, x_t and w_t, given W before it is turned by G
     inline void covariances(int t, const V* A, const V* G, const V* W, const V* Pp) const {
-        V *B = cross.B + t * n * n, *X0 = cross.X0 + t * n * n, *X1 = cross.X1 + t * n * n;
+        V *B = cross.B + t * n * n, *X0 = cross.X0 + t * n * n, *X1 = cross.X1 + t * n * n, *own = cross.W + t * n * n;
         const V* D = s.D + t * n;
         V WG[cap * cap], left[cap * cap], PA[cap * cap];
         for (int i = 0; i < n; i++)  // W G D and (I - P W) G D
@@ -721,6 +722,15 @@ struct Ep {
                     for (int k = 0; k < n; k++) q += W[i * n + k] * G[k * n + j];
                 }
                 WG[i * n + j] = q * D[j];
+            }
+        for (int i = 0; i < n; i++)  // D - D G' W G D
+            for (int j = 0; j < n; j++) {
+                V q = WG[i * n + j];
+                if (t > 0 && a.G.data) {
+                    q = V(0.0);
+                    for (int k = 0; k < n; k++) q += G[k * n + i] * WG[k * n + j];
+                }
+                own[i * n + j] = (i == j ? D[i] : V(0.0)) - D[i] * q;
             }
         for (int i = 0; i < n; i++)
             for (int j = 0; j < n; j++) {
@@ -751,6 +761,82 @@ struct Ep {
                 X0[i * n + j] = q;
                 B[i * n + j] = p;
             }
+    }
+
+    // What log Z lacks, to second order in what the sites leave out (Opper, Paquet and Winther 2013): every two factors
+    // with tilted cumulants k_r add k_r k_r' (Cov(z, z') / (Var(z) Var(z')))^r / r!, r = 3 and 4, up to `shape_reach` rows apart.
+    // Rows with two explanations are left out: theirs is no small correction.
+    V second() const {
+        V total(0.0), R[shape_reach][cap * cap], C[shape_reach][cap * cap];
+        for (int t = 0; t <= a.T; t++) {
+            V M[cap * cap], W[cap * cap], h[cap];
+            int last = 0;
+            for (int l = 1; l <= shape_reach && t + l <= a.T; l++) {
+                const int u = t + l;
+                if (l > 1) gain(R[l - 2], u - 1, M);
+                else
+                    for (int i = 0; i < n * n; i++) M[i] = V(i % (n + 1) == 0 ? 1.0 : 0.0);
+                product(M, cross.X0 + u * n * n, C[l - 1]);
+                product(M, cross.B + u * n * n, R[l - 1]);
+                last = l;
+            }
+            const V *S = cross.S + t * n * n, *X1 = cross.X1 + t * n * n;
+            for (int i = 0; i < n; i++)
+                for (int j = 0; j < n; j++) M[i * n + j] = X1[j * n + i];
+            gain(M, t, W);  // w_t given x_t
+            for (int i = 0; i < n; i++) {
+                if (!has_site(t, i)) continue;
+                const V w3 = cross.w3[t * n + i], w4 = cross.w4[t * n + i];
+                for (int j = 0; j < i; j++) pair(cross.W[t * n * n + i * n + j], w3, w4, cross.w3[t * n + j], cross.w4[t * n + j], total);
+                with_rows(t, a.start[t], M + i * n, w3, w4, total);
+                later(t, last, W + i * n, w3, w4, C, R, total);
+            }
+            for (int k = a.start[t]; k < a.start[t + 1]; k++) {
+                if (!bends(k)) continue;
+                V Sh[cap];
+                row(k, h);
+                for (int i = 0; i < n; i++) {
+                    Sh[i] = V(0.0);
+                    for (int j = 0; j < n; j++) Sh[i] += S[i * n + j] * h[j];
+                }
+                with_rows(t, k + 1, Sh, cross.r3[k], cross.r4[k], total);
+                later(t, last, h, cross.r3[k], cross.r4[k], C, R, total);
+            }
+        }
+        return total;
+    }
+    inline bool bends(int k) const { return kind(k) != noise_gaussian && (kind(k) < noise_contaminated || kind(k) == ep_truncation); }
+    inline void pair(const V& c, const V& a3, const V& a4, const V& b3, const V& b4, V& total) const {
+        const V cube = c * c * c;
+        total += cube * (a3 * b3 * V(1.0 / 6.0) + c * a4 * b4 * V(1.0 / 24.0));
+    }
+    // with the rows of stage t from k on, given the covariance with x_t
+    inline void with_rows(int t, int k, const V* cov, const V& a3, const V& a4, V& total) const {
+        for (; k < a.start[t + 1]; k++) {
+            if (!bends(k)) continue;
+            V h[cap], c(0.0);
+            row(k, h);
+            for (int j = 0; j < n; j++) c += cov[j] * h[j];
+            pair(c, a3, a4, cross.r3[k], cross.r4[k], total);
+        }
+    }
+    // with what comes later, of what acts on x_t as g does; C, R: covariance of x_t with the noise and the state of t + 1, ...
+    inline void later(int t, int last, const V* g, const V& a3, const V& a4, const V (*C)[cap * cap], const V (*R)[cap * cap],
+                      V& total) const {
+        for (int l = 0; l < last; l++) {
+            const int u = t + l + 1;
+            V cov[cap];
+            for (int j = 0; j < n; j++) {
+                V c(0.0), q(0.0);
+                for (int i = 0; i < n; i++) {
+                    c += g[i] * C[l][i * n + j];
+                    q += g[i] * R[l][i * n + j];
+                }
+                cov[j] = q;
+                if (has_site(u, j)) pair(c, a3, a4, cross.w3[u * n + j], cross.w4[u * n + j], total);
+            }
+            with_rows(u, a.start[u], cov, a3, a4, total);
+        }
     }
 
     // Third and fourth cumulants of the states, to first order in what the sites leave out: a factor whose tilted

@@ -53,6 +53,7 @@ struct EpArgs {
     double *x, *P;                 // (members,T+1,n), (members,T+1,n,n)
     double *k3, *k4;               // (members,T+1,n): standardised cumulants of the states; or null
     double *log_z, *slope;         // (members,), (members,groups+1)
+    double* more;                  // (members,): what log Z lacks to second order; or null
     double* learned;               // (members,groups): sum of (1 - posterior / prior variance)^2
     double *residual, *worst;      // (members,)
     double* out;                   // (members,rows) probability that a row is an outlier or lost; or null
@@ -73,8 +74,8 @@ struct EpBefore {
     int common, low, high, there;     // stages but the first; rows here, and the first of them there
 };
 
-// Half-widths and the rate of outliers found by evidence; see core/ep_learn.hpp. `base` has a member for each of `ep_abreast` lanes
-// (its m, D, tau, nu hold one: the mode's).
+// Half-widths and the rate of outliers found by evidence; see core/ep_learn.hpp. `base` has a member for each node, up to a
+// multiple of `ep_abreast` (its m, D, tau, nu hold one: the mode's).
 struct EpLearnArgs {
     EpArgs base;
     const EpArgs* outside;                   // the chain with its bounds alone, or null
@@ -93,11 +94,14 @@ struct EpLearnArgs {
     const double *pull, *precision;          // (groups,), (groups,groups): what is known already, in u = s^warp; or null
     int steps, few, many, most;              // Newton steps; sweeps of a step, of the first one, of a node
     double tol, tol_nodes, close, near, least, narrow;  // near: the distance of the mode that does where sites are warm
-    int nodes;
-    const double *z, *log_proposal;          // (nodes, q), (nodes,)
+    int nodes, stage;                        // at most so many points, so many a stage
+    double usable;                           // disagreement of moments from which a point counts as not settled
+    double enough;                           // doubt about the states, in standard deviations, that ends the stages
+    const double* z;                         // (nodes, q): standard normal
     // found
     double *mode, *H, *phi, *log_weight;     // (q,), (q,q), (nodes,q), (nodes,)
-    double *node_slope;                      // (nodes,q): d log Z / d phi at each node
+    double *node_slope, *second;             // (nodes,q): d log Z / d phi at each node; (nodes,) what log Z lacks there
+    double *value, *share, *residuals;       // (nodes,): log posterior, weight, disagreement of moments
     double *x, *P, *k3, *k4, *centre, *out;  // (T+1,n), (T+1,n,n), ...: of the mixture; out (rows,) or null
     double *log_evidence, *log_mode, *log_prior, *residual;  // of the data; Z times prior, and the prior, at the mode
     std::int32_t* used;                      // nodes

@@ -5,7 +5,8 @@
 //
 //     H = -Cov(g, u) Cov(u)^-1,    pull = E g + H E u,    g = d log Z / du,
 //
-// the moments being those of the posterior over u, the weighted nodes (`ep_told`).
+// the moments being those of the posterior over u, the weighted nodes (`ep_told`). What log Z lacks to second order has no
+// slope of its own: pull gets that of a line through the nodes, Cov(u)^-1 Cov(u, second).
 // State: the forwards message of the sites (`ep_edge`), of which a later window takes the one before its first row.
 // Sites: those of the rows that two windows share (`ep_moved`).
 #pragma once
@@ -237,7 +238,7 @@ inline void ep_told(const EpLearnArgs& a, int q, double* work) {
         constexpr double flatter[4] = {1.0, 0.5, 0.25, 0.0};
         for (const double flat : flatter)  // few nodes carry the weight: they alone cannot tell a slope
             if (ep_weights(K, a.log_weight, keep, flat, w) > 2.0 * f + 2.0) break;
-        double mean[ep_free] = {}, level[ep_free] = {}, S[ep_free * ep_free] = {}, X[ep_free * ep_free] = {}, L[ep_free * ep_free], pivot[ep_free], inverse[ep_free];
+        double mean[ep_free] = {}, level[ep_free] = {}, more[ep_free] = {}, S[ep_free * ep_free] = {}, X[ep_free * ep_free] = {}, L[ep_free * ep_free], pivot[ep_free], inverse[ep_free];
         for (int k = 0; k < K; k++)
             if (keep[k])
                 for (int j = 0; j < f; j++) {
@@ -249,16 +250,18 @@ inline void ep_told(const EpLearnArgs& a, int q, double* work) {
                 for (int i = 0; i < f; i++)
                     for (int j = 0; j < f; j++) {
                         const double du = w[k] * (u[k * f + i] - mean[i]);
+                        if (j == 0) more[i] += du * a.second[k];
                         S[i * f + j] += du * (u[k * f + j] - mean[j]);
                         X[i * f + j] += du * (d[k * f + j] - level[j]);
                     }
         for (int j = 0; j < f; j++) S[j * f + j] *= 1.0 + 1e-6;
         ldl(Dim<0>(f), S, L, pivot, inverse);
         ldl_solve(Dim<0>(f), Dim<0>(f), L, inverse, X);
+        ldl_solve(Dim<0>(f), Dim<1>(), L, inverse, more);
         for (int i = 0; i < f; i++)
             for (int j = 0; j < f; j++) H[i * f + j] = -0.5 * (X[i * f + j] + X[j * f + i]);
         for (int i = 0; i < f; i++) {
-            pull[i] = level[i];
+            pull[i] = level[i] + more[i];
             for (int j = 0; j < f; j++) pull[i] += H[i * f + j] * mean[j];
         }
     }

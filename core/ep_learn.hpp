@@ -6,8 +6,11 @@
 // no scale of its own. What other data have told is a term pull'u - u'precision u / 2 beside it, u = s^warp.
 // log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the lanes one holds phi, the others
 // phi + h e_j, whose slopes give columns of the Hessian, other coordinates at the next step where there are more
-// coordinates than lanes. Around the mode, `nodes` points phi + H^(-1/2) z_k are evaluated and weighted by evidence over
-// proposal; the answer is their mixture. A half-width that may as well be 0 has an exponential tail in log s and none in a
+// coordinates than lanes. Then points are evaluated, `stage` by `stage`: the first stage around the mode with the
+// covariance H^-1, each later one with the weighted moments of all points so far. A point's weight is its evidence over
+// the mixture of all stages' Gaussians (adaptive multiple importance sampling, Cornuet et al. 2012), the answer the points'
+// mixture; no more stages are asked for once their number leaves less than `enough` standard deviations in doubt. The
+// evidence of a point is that of expectation propagation and what that lacks to second order (Ep::second). A half-width that may as well be 0 has an exponential tail in log s and none in a
 // power of s, so the search and the nodes live in u = s^warp (its density has the prior s^(a-warp) in log s, and at its
 // mode the two Hessians differ by du/dphi only). Sites follow phi from point to point, so a point costs few sweeps.
 //
@@ -23,6 +26,10 @@ namespace hw {
 namespace HW_ISA {
 
 constexpr int ep_alone = 10;  // sweeps of a chain with its bounds alone, which starts afresh
+constexpr int ep_stages = 8;  // most stages of points
+constexpr double ep_lean = 4.0;  // points that a first guess of their covariance is worth
+constexpr double ep_wide = 1.15;  // by how much a stage reaches farther than the posterior is thought to
+constexpr double ep_some = 10.0;  // effective points without which the evidence itself is in doubt
 constexpr int ep_few = 2;     // rows that may come or go while the mode stays
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
@@ -65,16 +72,23 @@ struct EpLearner {
     double told(int j, int l) const {
         return std::sqrt(min2(max2(f.learned[group[j]][l] / max2(a.count[group[j]], 1.0), 1e-12), 1.0));
     }
-    double log_prior(const double* phi, int l) const {
-        double p = known(phi);
+    // logarithm of the prior's part that the data decide
+    double log_told(int l) const {
+        double p = 0.0;
         for (int j = 0; j < q; j++)
-            p += group[j] >= 0 ? (a.power - a.warp) * phi[j] + a.reference * std::log(told(j, l))
+            if (group[j] >= 0) p += a.reference * std::log(told(j, l));
+        return p;
+    }
+    double log_prior(const double* phi, int l) const {
+        double p = known(phi) + log_told(l);
+        for (int j = 0; j < q; j++)
+            p += group[j] >= 0 ? (a.power - a.warp) * phi[j]
                                : a.beta_a * phi[j] - (a.beta_a + a.beta_b) * std::log1p(std::exp(phi[j]));
         return p;
     }
-    // What is told grows with s^2 / (s^2 + what blurs it), so d log told / d log s = 2 (1 - told), near enough for a search.
-    double prior_slope(int j, const double* phi, int l) const {
-        return group[j] >= 0 ? a.power - a.warp + 2.0 * a.reference * (1.0 - told(j, l)) + known_slope(j, phi)
+    // the slope of the rest
+    double prior_slope(int j, const double* phi) const {
+        return group[j] >= 0 ? a.power - a.warp + known_slope(j, phi)
                              : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi[j]));
     }
 
@@ -299,7 +313,7 @@ struct EpLearner {
             const bool sound = ep.sound(f, l);
             value[l] = sound ? f.log_z[l] + log_prior(phi[l], l) : minus_inf;
             for (int j = 0; j < q; j++)
-                slope[l][j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l] + prior_slope(j, phi[l], l);
+                slope[l][j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l] + prior_slope(j, phi[l]);
         }
     }
     // the same with the bounds as a condition; where they alone have no evidence at the start they
@@ -398,6 +412,9 @@ struct EpLearner {
             for (int i = 0; i < q; i++) column[j][i] = known_curve(i, j, phi);
             column[j][j] += max2(group[j] >= 0 ? 0.3 * a.count[group[j]] : 1.0, a.least);
         }
+        // Of told only its own half-width's slope is climbed: it grows with s^2 / (s^2 + what blurs it), so d log told / d log s
+        // = 2 (1 - told). What it loses to the others would lead to modes of next to no noise, far from where the mass is.
+        double kept_value = minus_inf;  // without told
         int next = 0, missing = q;
         *best = minus_inf;
         double d[ep_free] = {}, trial[ep_free];
@@ -423,7 +440,9 @@ struct EpLearner {
             if (begin == led) recall(at);
             else ep.start();
             evaluate_inside(at, begin == afresh ? a.many : a.few, 0.3 * a.tol, value, slope, begin, *best == minus_inf);
-            if (!(value[0] > *best - 0.05 * q) && refused < 6) {  // too far, or no trajectory fits
+            double may = 0.05 * q;
+            for (int j = 0; j < q; j++) may += 2.0 * a.reference * std::fabs(d[j]);
+            if (!(value[0] - log_told(0) > kept_value - may) && refused < 6) {  // too far, or no trajectory fits
                 refused++;
                 if (*best == minus_inf) {  // the start itself: wider half-widths fit more
                     for (int j = 0; j < q; j++) phi[j] = min2(max2(phi[j] + (group[j] >= 0 ? 0.7 : 0.0), lo[j]), hi[j]);
@@ -438,14 +457,18 @@ struct EpLearner {
             if (value[0] == minus_inf) return 2;
             refused = 0;
             *best = value[0];
+            kept_value = value[0] - log_told(0);
             *a.log_prior = log_prior(trial, 0);
             for (int j = 0; j < q; j++) {
                 phi[j] = trial[j];
-                g[j] = slope[0][j];
+                g[j] = slope[0][j] + (group[j] >= 0 ? 2.0 * a.reference * (1.0 - told(j, 0)) : 0.0);
             }
             for (int l = 1; l < wide_lanes; l++)
                 if (along[l] >= 0 && value[l] > minus_inf) {
-                    for (int i = 0; i < q; i++) column[along[l]][i] = -(slope[l][i] - slope[0][i]) / h[l];
+                    for (int i = 0; i < q; i++) {
+                        const double saturates = group[i] >= 0 ? 2.0 * a.reference * (told(i, l) - told(i, 0)) : 0.0;
+                        column[along[l]][i] = -(slope[l][i] - slope[0][i] - saturates) / h[l];
+                    }
                     // an unmeasured column mirrors a measured one
                     for (int i = 0; i < q; i++)
                         if (!measured[i] && i != along[l]) column[i][along[l]] = column[along[l]][i];
@@ -461,18 +484,109 @@ struct EpLearner {
         return length < 1.0 ? 0 : 1;
     }
 
-    // The mixture over the nodes is kept as weighted raw moments about the first node's mean.
-    void scale_sums(double by) {
-        const std::ptrdiff_t size = stage_count(), square = size * ep.n;
-        for (std::ptrdiff_t k = 0; k < size; k++) {
-            a.x[k] *= by;
-            a.k3[k] *= by;
-            a.k4[k] *= by;
-        }
-        for (std::ptrdiff_t k = 0; k < square; k++) a.P[k] *= by;
-        if (a.out)
-            for (int k = 0; k < a.base.rows; k++) a.out[k] *= by;
+    // ---- the points' mixture ---------------------------------------------------------------------------------------
+
+    // Gaussian that a stage's points are drawn from, about the mode: v = m + K z
+    struct Stage {
+        int count;
+        double m[ep_free], K[ep_free][ep_free], log_det;  // of K
+    };
+    Stage stage[ep_stages] = {};
+    int stages_used = 0;
+
+    // v, 0 at the mode, of a parameter
+    double place_of(int j, double phi, double mode) const {
+        return group[j] < 0 ? phi - mode : (std::exp(a.warp * (phi - mode)) - 1.0) / a.warp;
     }
+    // from mean and covariance; couplings shrink until the factor exists
+    void plan(Stage& at, const double* m, const double (*S)[ep_free]) const {
+        for (double keep = 1.0; !factor(S, keep, at.K); keep *= 0.7) {}
+        at.log_det = 0.0;
+        for (int j = 0; j < q; j++) {
+            at.m[j] = m[j];
+            for (int i = 0; i <= j; i++) at.K[j][i] *= ep_wide;
+            at.log_det += std::log(at.K[j][j]);
+        }
+    }
+    // log of the mixture of the stages' densities over the first stage's unit
+    double log_drawn(const double* v, int total) const {
+        double term[ep_stages], top = minus_inf, sum = 0.0;
+        for (int k = 0; k < stages_used; k++) {
+            const Stage& at = stage[k];
+            double z[ep_free], square = 0.0;
+            for (int i = 0; i < q; i++) {
+                z[i] = v[i] - at.m[i];
+                for (int j = 0; j < i; j++) z[i] -= at.K[i][j] * z[j];
+                z[i] /= at.K[i][i];
+                square += z[i] * z[i];
+            }
+            term[k] = std::log(static_cast<double>(at.count) / total) - 0.5 * square - (at.log_det - stage[0].log_det);
+            top = max2(top, term[k]);
+        }
+        for (int k = 0; k < stages_used; k++) sum += std::exp(term[k] - top);
+        return top + std::log(sum) - 0.5 * q * log_2pi;
+    }
+    // weights of the points so far, their sum one, into `share`; returns the effective number, 0: none is sound
+    double weigh(const double* mode, int total, double* share, double* log_sum) const {
+        double top = minus_inf, sum = 0.0, squares = 0.0;
+        bool settled = false;  // a point that did not settle counts only where none did
+        for (int k = 0; k < total; k++) settled = settled || (a.value[k] > minus_inf && a.residuals[k] < a.usable);
+        for (int k = 0; k < total; k++) {
+            double v[ep_free];
+            for (int j = 0; j < q; j++) v[j] = place_of(j, a.phi[k * q + j], mode[j]);
+            const bool counts = a.value[k] > minus_inf && (!settled || a.residuals[k] < a.usable);
+            a.log_weight[k] = !counts ? minus_inf : stages_used ? a.value[k] - log_drawn(v, total) : a.value[k];
+            top = max2(top, a.log_weight[k]);
+        }
+        if (top == minus_inf) return 0.0;
+        for (int k = 0; k < total; k++) sum += share[k] = std::exp(a.log_weight[k] - top);
+        for (int k = 0; k < total; k++) {
+            share[k] /= sum;
+            squares += share[k] * share[k];
+        }
+        *log_sum = top + std::log(sum);
+        return 1.0 / squares;
+    }
+    // the next stage: moments of the weighted points, leaning on the first stage where few carry the weight
+    void refit(const double* mode, int total, const double* share, double effective, const double (*first)[ep_free]) {
+        double m[ep_free] = {}, S[ep_free][ep_free] = {};
+        const double lean = effective / (effective + ep_lean), wider = lean * (1.0 + 1.0 / effective);
+        for (int k = 0; k < total; k++)
+            for (int j = 0; j < q; j++)
+                if (share[k] > 0.0) m[j] += share[k] * place_of(j, a.phi[k * q + j], mode[j]);
+        for (int k = 0; k < total; k++) {
+            if (!(share[k] > 0.0)) continue;
+            double d[ep_free];
+            for (int j = 0; j < q; j++) d[j] = place_of(j, a.phi[k * q + j], mode[j]) - m[j];
+            for (int i = 0; i < q; i++)
+                for (int j = 0; j < q; j++) S[i][j] += wider * share[k] * d[i] * d[j];
+        }
+        for (int i = 0; i < q; i++)
+            for (int j = 0; j < q; j++) S[i][j] += (1.0 - lean) * first[i][j];
+        plan(stage[stages_used], m, S);
+    }
+    // mean square over the states of what the choice of points leaves in doubt, in standard deviations: the share of the
+    // variance that lies between points, over their effective number
+    double doubt(int total, const double* share, double effective) const {
+        const EpArgs& b = a.base;
+        const std::ptrdiff_t size = stage_count();
+        double all = 0.0;
+        for (std::ptrdiff_t i = 0; i < size; i++) {
+            double mean = 0.0, within = 0.0, between = 0.0;
+            for (int k = 0; k < total; k++)
+                if (share[k] > 0.0) mean += share[k] * b.x[k * size + i];
+            for (int k = 0; k < total; k++)
+                if (share[k] > 0.0) {
+                    const double d = b.x[k * size + i] - mean;
+                    between += share[k] * d * d;
+                    within += share[k] * max2(b.P[(k * size + i) * ep.n + i % ep.n], 0.0);
+                }
+            all += between / max2(between + within, 1e-300);
+        }
+        return all / (size * effective);
+    }
+
+    // weighted raw moments about `centre`
     void add(int l, double weight) {
         const EpArgs& b = a.base;
         const int n = ep.n;
@@ -491,9 +605,8 @@ struct EpLearner {
         if (a.out)
             for (int k = 0; k < b.rows; k++) a.out[k] += weight * b.out[static_cast<std::ptrdiff_t>(l) * b.rows + k];
     }
-    void finish(double sum) {
+    void finish() {
         const int n = ep.n;
-        scale_sums(1.0 / sum);
         for (int t = 0; t <= a.base.T; t++) {
             const std::ptrdiff_t to = static_cast<std::ptrdiff_t>(t) * n;
             for (int i = 0; i < n; i++) {
@@ -510,19 +623,54 @@ struct EpLearner {
         }
     }
 
-    // Whether the nodes lie where the posterior is: its mean near their centre, and not the weight of a few.
-    bool central(int nodes) const {
-        double top = minus_inf, sum = 0.0, square = 0.0, mean[ep_free] = {};
-        for (int k = 0; k < nodes; k++) top = max2(top, a.log_weight[k]);
-        for (int k = 0; k < nodes; k++) {
-            const double w = std::exp(a.log_weight[k] - top);
-            sum += w;
-            square += w * w;
-            for (int j = 0; j < q; j++) mean[j] += w * a.z[k * q + j];
+    // the lanes' worth of points from k on, those before `end` that a stage asks for; found are their members, `phi`, `value`
+    void evaluate_nodes(int k, int end, const Stage& now, const double* mode) {
+        double at[wide_lanes][ep_free], value[wide_lanes], slope[wide_lanes][ep_free];
+        bool inside[wide_lanes];
+        for (int l = 0; l < wide_lanes; l++) {
+            inside[l] = k + l < end;
+            for (int j = 0; j < q; j++) at[l][j] = mode[j];
+            if (now.count > 1 && inside[l]) {
+                for (int i = 0; i < q; i++) {
+                    double v = now.m[i];
+                    for (int j = 0; j <= i; j++) v += now.K[i][j] * a.z[(k + l) * q + j];
+                    const double u = 1.0 + a.warp * v;  // s^warp over the mode's
+                    at[l][i] = group[i] < 0 ? mode[i] + v : u > 0.0 ? mode[i] + std::log(u) / a.warp : lo[i] - 1.0;
+                    if (at[l][i] > hi[i] || at[l][i] < lo[i]) inside[l] = false;
+                }
+                if (!inside[l])
+                    for (int j = 0; j < q; j++) at[l][j] = mode[j];
+            }
+            put(l, at[l]);
         }
-        for (int j = 0; j < q; j++)
-            if (!(std::fabs(mean[j]) < a.near * sum)) return false;
-        return sum * sum > 3.0 * square;
+        ep.block = {k, k + wide_lanes - 1};
+        if (outside) outside->block = ep.block;
+        const Begin begin = now.count > 1 && resume(k, at) ? resumed : led;
+        if (begin == led) recall(at);
+        evaluate_inside(at, a.most, a.tol_nodes, value, slope, begin, false);
+        if (now.count > 1) hold(k, at);
+        ep.shapes(a.base.k3, a.base.k4);
+        const V more = ep.second();
+        for (int l = 0; l < wide_lanes && k + l < end; l++) {
+            for (int j = 0; j < q; j++) {
+                a.phi[(k + l) * q + j] = at[l][j];
+                a.node_slope[(k + l) * q + j] = f.slope[group[j] >= 0 ? group[j] : a.base.groups][l];
+            }
+            a.second[k + l] = finite(more[l]) ? more[l] : 0.0;  // so sharp a box that its cumulants overflow
+            a.residuals[k + l] = f.residual[l];
+            a.value[k + l] = inside[l] && value[l] > minus_inf ? value[l] + a.second[k + l] : minus_inf;
+        }
+    }
+
+    // Whether the nodes lie where the posterior is: its mean near their first centre, and not the weight of a few.
+    bool central(int count, const double* mode, const double (*H)[ep_free], double effective) const {
+        for (int j = 0; j < q; j++) {
+            double mean = 0.0;
+            for (int k = 0; k < count; k++)
+                if (a.share[k] > 0.0) mean += a.share[k] * place_of(j, a.phi[k * q + j], mode[j]);
+            if (!(std::fabs(mean) * std::sqrt(H[j][j]) < a.near)) return false;
+        }
+        return effective > 3.0;
     }
 
     int run() {
@@ -571,8 +719,16 @@ struct EpLearner {
             best = a.before->log_mode;  // in log s already
             *a.log_prior = a.before->log_prior;
         } else if (q > 0) {
+            // far from the mode the evidence of the bounds alone misleads: first without it
+            Ep<N>* const bounds = outside;
+            outside = nullptr;
             code = climb(phi, H, &best, warm);
             if (code == 2) return 2;
+            if (bounds) {
+                outside = bounds;
+                code = climb(phi, H, &best, true);
+                if (code == 2) return 2;
+            }
         } else {
             double at[wide_lanes][ep_free] = {}, value[wide_lanes], slope[wide_lanes][ep_free];
             if (warm) recall(at);
@@ -599,88 +755,72 @@ struct EpLearner {
             b.nu[k] = keep_nu[k];
         }
         const int nodes = alone(H) ? 1 : a.nodes;
-        *a.used = nodes;
         ep.cross = wanted;
         const std::ptrdiff_t size = stage_count();
         for (std::ptrdiff_t k = 0; k < size; k++) a.x[k] = a.k3[k] = a.k4[k] = 0.0;
         for (std::ptrdiff_t k = 0; k < size * ep.n; k++) a.P[k] = 0.0;
         if (a.out)
             for (int k = 0; k < b.rows; k++) a.out[k] = 0.0;
-        double top = minus_inf, sum = 0.0;
-        *a.residual = 0.0;
-        bool first = true;
-        for (int k = 0; k < nodes; k += wide_lanes) {
-            double at[wide_lanes][ep_free], value[wide_lanes], slope[wide_lanes][ep_free];
-            bool inside[wide_lanes];
-            for (int l = 0; l < wide_lanes; l++) {
-                inside[l] = k + l < nodes;
-                for (int j = 0; j < q; j++) at[l][j] = phi[j];
-                if (nodes > 1 && inside[l]) {
-                    double x[ep_free];
-                    for (int i = q - 1; i >= 0; i--) {  // L' x = z
-                        double s = a.z[(k + l) * q + i];
-                        for (int j = i + 1; j < q; j++) s -= L[j][i] * x[j];
-                        x[i] = s / L[i][i];
-                    }
-                    for (int j = 0; j < q; j++) {
-                        const double u = 1.0 + a.warp * x[j];  // s^warp over the mode's
-                        at[l][j] = group[j] < 0 ? phi[j] + x[j] : u > 0.0 ? phi[j] + std::log(u) / a.warp : lo[j] - 1.0;
-                        if (at[l][j] > hi[j] || at[l][j] < lo[j]) inside[l] = false;
-                    }
-                    if (!inside[l])
-                        for (int j = 0; j < q; j++) at[l][j] = phi[j];
+        double S[ep_free][ep_free] = {};  // H^-1
+        if (nodes > 1) {
+            for (int c = 0; c < q; c++) {
+                double x[ep_free];
+                for (int i = 0; i < q; i++) {
+                    x[i] = i == c ? 1.0 : 0.0;
+                    for (int j = 0; j < i; j++) x[i] -= L[i][j] * x[j];
+                    x[i] /= L[i][i];
                 }
-                put(l, at[l]);
+                for (int i = q - 1; i >= 0; i--) {
+                    for (int j = i + 1; j < q; j++) x[i] -= L[j][i] * x[j];
+                    x[i] /= L[i][i];
+                    S[i][c] = x[i];
+                }
             }
-            const Begin begin = nodes > 1 && resume(k, at) ? resumed : led;
-            if (begin == led) recall(at);
-            evaluate_inside(at, a.most, a.tol_nodes, value, slope, begin, false);
-            if (nodes > 1) hold(k, at);
-            ep.shapes(b.k3, b.k4);
-            for (int l = 0; l < wide_lanes && k + l < nodes; l++) {
-                for (int j = 0; j < q; j++) {
-                    a.phi[(k + l) * q + j] = at[l][j];
-                    a.node_slope[(k + l) * q + j] = f.slope[group[j] >= 0 ? group[j] : b.groups][l];
-                }
-                double lw = inside[l] && value[l] > minus_inf ? value[l] - (nodes > 1 ? a.log_proposal[k + l] : 0.0) : minus_inf;
-                a.log_weight[k + l] = lw;
-                if (lw == minus_inf) continue;
-                if (first) {
-                    for (std::ptrdiff_t i = 0; i < size; i++) a.centre[i] = b.x[l * size + i];
-                    first = false;
-                }
-                if (lw > top) {
-                    if (sum > 0) {
-                        const double by = std::exp(top - lw);
-                        scale_sums(by);
-                        sum *= by;
-                        *a.residual *= by;
-                    }
-                    top = lw;
-                }
-                const double w = std::exp(lw - top);
-                sum += w;
-                *a.residual += w * f.residual[l];
-                add(l, w);
-            }
+            const double none[ep_free] = {};
+            plan(stage[0], none, S);
         }
-        if (!(sum > 0.0)) return 2;
-        finish(sum);
-        *a.residual /= sum;
+        int done = 0;
+        double effective = 0.0, log_sum = 0.0;
+        while (done < nodes) {
+            Stage& now = stage[stages_used];
+            const int from = done, left = nodes - done;
+            now.count = left < 2 * a.stage || stages_used == ep_stages - 1 ? left : a.stage;
+            for (; done < from + now.count; done += wide_lanes) evaluate_nodes(done, from + now.count, now, phi);
+            done = from + now.count;
+            if (nodes > 1) stages_used++;
+            effective = weigh(phi, done, a.share, &log_sum);
+            if (done == nodes) break;
+            if (effective > ep_some && doubt(done, a.share, effective) < a.enough * a.enough) break;
+            if (effective > 0.0) refit(phi, done, a.share, effective, S);
+            else stage[stages_used] = now;
+        }
+        *a.used = done;
+        if (!(effective > 0.0)) return 2;
+        ep.block = {0, wide_lanes - 1};
+        int heaviest = 0;
+        for (int k = 1; k < done; k++)
+            if (a.share[k] > a.share[heaviest]) heaviest = k;
+        for (std::ptrdiff_t i = 0; i < size; i++) a.centre[i] = b.x[heaviest * size + i];
+        *a.residual = 0.0;
+        for (int k = 0; k < done; k++)
+            if (a.share[k] > 0.0) {
+                add(k, a.share[k]);
+                *a.residual += a.share[k] * a.residuals[k];
+            }
+        finish();
         double half_log_det = 0.0;
         for (int j = 0; j < q; j++) {
             const double to_phi = group[j] >= 0 ? a.warp * phi[j] : 0.0;
-            half_log_det += std::log(L[j][j]) - to_phi;
+            half_log_det += (nodes > 1 ? -std::log(stage[0].K[j][j]) : std::log(L[j][j])) - to_phi;
             if (again) continue;
             *a.log_prior += to_phi;
             best += to_phi;
         }
         *a.log_mode = best;
-        *a.log_evidence = nodes > 1 ? top + std::log(sum / nodes) - half_log_det
-                                    : top + 0.5 * q * log_2pi - half_log_det;
+        *a.log_evidence = log_sum + (nodes > 1 ? -std::log(static_cast<double>(done)) : 0.5 * q * log_2pi) - half_log_det;
         *a.sweeps_used = sweeps;
         *a.since = again ? a.before->since + 1 : 0;
-        if (nodes == 1 || !central(nodes)) *a.since = a.again;
+        if (nodes == 1 || !central(done, phi, H, effective)) *a.since = a.again;
         return code;
     }
 };

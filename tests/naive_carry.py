@@ -36,7 +36,7 @@ def told(free, found, warp, before=None):
         h = g[0] + H @ u[0]
     else:
         sound = np.isfinite(log_weight) & np.isfinite(g).all(axis=1)
-        u, g, log_weight = u[sound], g[sound], log_weight[sound]
+        u, g, log_weight, second = u[sound], g[sound], log_weight[sound], found["second"][:K][sound]
         if len(u) < q + 2:
             return pull, precision
         for flat in (1.0, 0.5, 0.25, 0.0):
@@ -50,7 +50,7 @@ def told(free, found, warp, before=None):
         S[np.diag_indices(q)] *= 1.0 + 1e-6
         H = -np.linalg.solve(S, (w[:, None] * du).T @ dg)
         H = 0.5 * (H + H.T)
-        h = level + H @ mean
+        h = level + np.linalg.solve(S, du.T @ (w * second)) + H @ mean
     precision[np.ix_(f, f)] = H
     pull[f] = h
     return pull, precision

@@ -66,10 +66,11 @@ def test_it_equals_the_dense_twin(name):
     model, record, s = system(3, **CASES[name])
     chain = sites(model, record)
     found = run(chain, s)
-    x, P, log_z = naive.propagate(chain.problem, s)
+    x, P, log_z, second = naive.propagate(chain.problem, s)
     np.testing.assert_allclose(found["x"][0], x, atol=1e-8)
     np.testing.assert_allclose(found["P"][0], P, atol=1e-8)
     assert found["log_z"][0] == pytest.approx(log_z, abs=1e-7)
+    assert found["second"][0] == pytest.approx(second, abs=1e-6)
     assert found["residual"][0] < 1e-9
 
 

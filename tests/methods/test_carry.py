@@ -62,7 +62,8 @@ def test_what_a_window_tells_is_the_slope_of_its_evidence():
     s = answer.start.s
 
     def evidence(s):
-        return _core.ep_run(chain.problem, s[None].copy(), np.zeros(1), 200, 1e-8, 1.0, None)["log_z"][0]
+        found = _core.ep_run(chain.problem, s[None].copy(), np.zeros(1), 200, 1e-8, 1.0, None)
+        return found["log_z"][0] + found["second"][0]
 
     at = np.sqrt(s)
     for direction in np.eye(5):
@@ -102,17 +103,17 @@ def test_a_stream_knows_what_the_batch_knows():
     np.testing.assert_allclose(widths["sd"], batch["sd"], rtol=1.0)
     rough = [np.mean(w["sd"] / w["mean"]) for w in (widths, short, single)]
     assert rough[0] < 0.8 * rough[1]
-    assert rough[0] < 0.6 * rough[2]
+    assert rough[0] < 0.7 * rough[2]
 
 
 def test_no_row_speaks_twice():
     carried = Carried(1, 1e12)
     one = Known(np.ones(1), np.ones((1, 1)))
     for newest in range(40):  # windows of 10 rows, each telling 1 in all
-        known = carried.known(newest - 9)
+        known = carried.known(newest - 9, 10)
         gone = max(newest - 9, 0)
         assert (0.0 if known is None else known.precision[0, 0]) <= gone / 10 + 1e-9
-        carried.waiting.append((newest, Known.none(1).plus(one, 0.1)))
+        carried.waiting.append((newest, one.times(0.1), Known.none(1)))
     assert carried.gone.precision[0, 0] == pytest.approx(3.0)
 
 

@@ -71,8 +71,8 @@ def test_half_widths_are_learned_without_bias():
         widths = est.info["half_widths"]
         assert np.all(widths["lo"] <= widths["mean"])
         assert np.all(widths["mean"] <= widths["hi"])
-    # one record tells q to 40 %, six to 17
-    np.testing.assert_allclose(np.mean(q, axis=0)[:2], 0.1, rtol=0.25)
+    # one record tells q to 40 %, six to 17: twice that
+    np.testing.assert_allclose(np.mean(q, axis=0)[:2], 0.1, rtol=0.33)
     np.testing.assert_allclose(np.mean(r, axis=0), 0.3, rtol=0.1)
 
 

@@ -11,9 +11,10 @@ row speaks twice and the prior of the newest window holds none of its own data. 
 likelihoods is a composite likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by
 exp(-1 / rows) a row.
 
-Bounds are a condition on what is carried: as a mere factor of the evidence they count as an event that small
-half-widths make likely, and over many windows that adds up. A quadratic of log P(inside | u), the evidence of the
-chain with its bounds alone, is taken off for every N-th window, N times as heavy.
+As a factor of the evidence bounds count as an event that small half-widths make likely, and over many windows that adds
+up. So they are a condition in all rows but 26, those of the newest window and those that have left alike
+(`condition`): a quadratic of log P(inside | u), the evidence of the chain with its bounds alone, is taken off. It is
+found anew in every N-th window.
 
 The state before the first row of a window is what the sites of the rows that have left make of it: the forwards message
 of expectation propagation, a Gaussian.
@@ -46,6 +47,15 @@ _SWEEPS, _WORST = 50, -60.0
 #: What the core found in a window and takes up in the next, beside the sites of the mode.
 HANDED_ON = ("lanes", "lane_phi", "mode", "H", "log_mode", "log_prior", "since")
 
+#: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone
+#: shape the path. In longer records bounds are a condition in the others.
+EVENT = 26
+
+
+def condition(rows: float) -> float:
+    """Return the power of the evidence of the bounds alone that the evidence of so many rows is divided by."""
+    return max(0.0, 1.0 - EVENT / max(rows, 1.0))
+
 
 class Known(NamedTuple):
     """What is known of half-widths (q, r): the logarithm pull' u - u' precision u / 2 in u = s^(1/2)."""
@@ -61,6 +71,10 @@ class Known(NamedTuple):
     def plus(self, other: "Known", weight: float = 1.0) -> "Known":
         """Add what other rows told."""
         return Known(self.pull + weight * other.pull, self.precision + weight * other.precision)
+
+    def times(self, weight: float) -> "Known":
+        """Return it weighted."""
+        return Known(weight * self.pull, weight * self.precision)
 
 
 def inside(chain: Sites, s: Array) -> Known:
@@ -117,8 +131,11 @@ class Carried:
 
     def __init__(self, p: int, rows: float) -> None:
         self.fade = math.exp(-1.0 / rows)
-        self.gone = Known.none(p)
-        self.waiting: list[tuple[int, Known]] = []  # newest row of a window, and what it told, weighted
+        self.gone, self.kept_in = Known.none(p), Known.none(p)  # by windows that have left, and their bounds alone
+        self.rows = 0.0  # rows that have left, faded
+        self.waiting: list[tuple[int, Known, Known]] = []  # newest row of a window, and both, weighted
+        self.inside = Known.none(p)  # bounds alone of the last window asked
+        self.given: Known | None = None  # what the newest window was told
         self.count = 0  # windows that told something
         self.start: Start | None = None
         self.first: Normal | None = None  # the state before the first row, once rows have left
@@ -126,12 +143,18 @@ class Carried:
         self._edge: tuple[Array, Array] | None = None  # mean and covariance of the newest window's stages, each given
         # what lies up to it: the forwards message of expectation propagation
 
-    def known(self, first: int) -> Known | None:
-        """Return what the windows tell that have no row from `first` on, None where there is none."""
-        self.gone = Known(self.gone.pull * self.fade, self.gone.precision * self.fade)
+    def known(self, first: int, rows: int) -> Known | None:
+        """Return what the windows tell that have no row from `first` on, for one of so many rows; None: nothing."""
+        self.gone, self.kept_in = self.gone.times(self.fade), self.kept_in.times(self.fade)
+        self.rows *= self.fade
         while self.waiting and self.waiting[0][0] < first:
-            self.gone = self.gone.plus(self.waiting.pop(0)[1])
-        return self.gone if self.gone.precision.any() else None
+            _, told, kept_in = self.waiting.pop(0)
+            self.gone, self.kept_in = self.gone.plus(told), self.kept_in.plus(kept_in)
+            self.rows += 1.0
+        self.given = None
+        if self.rows:
+            self.given = self.gone.plus(self.kept_in.plus(self.inside), -condition(rows + self.rows))
+        return self.given
 
     def leave(self, a: int) -> None:
         """Let go of the first a rows of the newest window: they tell the state that the next one begins at."""
@@ -158,19 +181,17 @@ class Carried:
         self._edge = answer.found["edge_x"], answer.found["edge_P"]
         if not counts:
             return
-        told = answer.told
-        known = Known(told.pull / rows, told.precision / rows)
         if self.count % rows == 0:
-            known = known.plus(inside(answer.chain, self.start.s), -1.0)
+            self.inside = inside(answer.chain, self.start.s)
         self.count += 1
-        self.waiting.append((newest, known))
+        self.waiting.append((newest, answer.told.times(1.0 / rows), self.inside.times(1.0 / rows)))
 
     def save(self) -> dict[str, Any]:
         """Return all of it as plain numbers."""
         start = self.start
         return {
-            "gone": [v.tolist() for v in self.gone],
-            "waiting": [[k, known.pull.tolist(), known.precision.tolist()] for k, known in self.waiting],
+            "gone": [_plain(self.gone), _plain(self.kept_in), _plain(self.inside), self.rows],
+            "waiting": [[k, _plain(told), _plain(inside)] for k, told, inside in self.waiting],
             "count": self.count,
             "s": None if start is None else start.s.tolist(),
             "before": None if start is None or start.before is None else [_bytes(v) for v in start.before],
@@ -180,10 +201,10 @@ class Carried:
 
     def load(self, saved: dict[str, Any]) -> None:
         """Take up what `save` returned."""
-        self.gone = Known(*(np.array(v, dtype=float) for v in saved["gone"]))
-        self.waiting = [
-            (int(k), Known(np.array(h, dtype=float), np.array(H, dtype=float))) for k, h, H in saved["waiting"]
-        ]
+        *sums, rows = saved["gone"]
+        self.gone, self.kept_in, self.inside = (_known(v) for v in sums)
+        self.rows = float(rows)
+        self.waiting = [(int(k), _known(told), _known(inside)) for k, told, inside in saved["waiting"]]
         self.count = int(saved["count"])
         self.start = None
         if saved["s"] is not None:
@@ -195,6 +216,14 @@ class Carried:
         first, edge = saved["first"], saved["edge"]
         self.first = None if first is None else Normal(*first)
         self._edge = None if edge is None else (np.array(edge[0], dtype=float), np.array(edge[1], dtype=float))
+
+
+def _plain(known: Known) -> list[Any]:
+    return [v.tolist() for v in known]
+
+
+def _known(saved: list[Any]) -> Known:
+    return Known(*(np.array(v, dtype=float) for v in saved))
 
 
 def _bytes(value: Any) -> str:

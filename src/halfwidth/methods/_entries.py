@@ -37,7 +37,8 @@ def with_entries(method: "Posterior", model: Linear, record: Record) -> Estimate
         return search.failed()
     L = search.width(theta)
     p = len(theta)
-    z, log_proposal = nodes(p, _NODES)
+    z = nodes(p, _NODES)
+    log_proposal = -0.5 * (z**2).sum(axis=1) - 0.5 * p * math.log(2 * math.pi)
     inner = replace(method, nodes=max(1, method.nodes // 4))
     found: list[tuple[float, Array, Estimate]] = []
     for k in range(len(z)):

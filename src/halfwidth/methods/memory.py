@@ -193,7 +193,7 @@ class _Foretelling(Sliding):
         method, held = self.window.method, self.carried
         assert isinstance(method, Posterior)
         solved = None if held is None else super()._solve(model, part, a)
-        known = held.gone if held is not None and held.gone.precision.any() else None
+        known = None if held is None else held.given
         y = part.y.copy()
         y[-1] = np.nan
         before = method.answer(model, Record(part.t, y, part.u), start=self._near, known=known)
@@ -252,7 +252,8 @@ def _at_nodes(chain: Sites, answer: Answer) -> tuple[Array, Array]:
     eps = 1.0 / (1.0 + np.exp(-phi[:, -1])) if phi.shape[1] > free.size else np.full(len(phi), answer.rate)
     run = _core.ep_run(chain.problem, s, eps, _SWEEPS, _CLOSE, _DAMPING, None)
     told = np.clip(run["learned"][:, free] / np.maximum(chain.count[free], 1.0), 1e-12, 1.0)
-    return run["log_z"], 0.5 * np.log(told).sum(axis=1)
+    second = np.where(np.isfinite(run["second"]), run["second"], 0.0)  # as the core takes it
+    return run["log_z"] + second, 0.5 * np.log(told).sum(axis=1)
 
 
 def _foretold(window: Window, model: Linear, record: Record) -> tuple[Array, Array]:

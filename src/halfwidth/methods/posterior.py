@@ -12,19 +12,24 @@ Staying inside `bounds` is an event that small half-widths make likely: over man
 The prior has no scale: where a noise drowns in the others told ~ s^2 and the prior falls to 0, where it is seen told
 is 1 and the prior is a power. `power` is what a study of coverage gave in windows of 6, 26 and 51
 rows (benchmarks/posterior.py).
-Around the mode, weighted nodes carry what is not known of s into the intervals, and first-order corrections of skewness
-and kurtosis bend the Gaussian marginals to the light tails that bounded noise has.
+Weighted nodes carry what is not known of s into the intervals: stages of normal points, the first about the mode,
+each later one with the moments of all before it, weighted by evidence over the mixture of the stages
+(core/ep_learn.hpp). The evidence of a node has what expectation propagation leaves out of it to second order, without
+which half-widths are learned with a bias. First-order corrections of skewness and kurtosis bend the Gaussian marginals
+to the light tails that bounded noise has.
 
 References
 ----------
 Minka (2001), Expectation propagation for approximate Bayesian inference, UAI. Opper, Paquet and Winther (2013),
 Perturbative corrections for approximate inference in Gaussian latent variable models, JMLR 14. Durbin and Koopman
-(2001), ch. 4: the disturbance smoother that gives every cavity. Model: Pavelková and Kárný (2013), eqs. (1), (2).
+(2001), ch. 4: the disturbance smoother that gives every cavity. Cornuet, Marin, Mira and Robert (2012), Adaptive
+multiple importance sampling, Scandinavian Journal of Statistics 39. Model: Pavelková and Kárný (2013), eqs. (1), (2).
 """
 
 import functools
 import math
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -33,7 +38,7 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
-from halfwidth.methods._carry import HANDED_ON, WARP, Carried, Known, Start
+from halfwidth.methods._carry import HANDED_ON, WARP, Carried, Known, Start, condition
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Frame, Sites, gaussian_part, sites, uniform_part, unknowns
 from halfwidth.model import Linear, Model, Nonlinear
@@ -43,16 +48,18 @@ from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box, Normal, Shaped
 
 #: Power of the half-widths' prior; see above.
-POWER = 0.85
+POWER = 0.5
+#: Nodes of a stage, and most stages (core/ep_learn.hpp).
+_STAGE, _STAGES = 16, 8
+#: Numbers that the beliefs of all nodes may take up; one stage is always had.
+_ROOM = 4e6
 #: Of the search and the nodes. The mode of the window before is a good centre of nodes up to the distance `near`, in
 #: standard deviations.
 _LIMITS = {
     "steps": 14, "few": 3, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 5e-3, "close": 0.05, "near": 0.8,
-    "least": 0.3, "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
+    "least": 2.0, "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
+    "stage": _STAGE, "enough": 0.06, "usable": 0.1,
 }  # fmt: skip
-#: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone
-#: shape the path. In longer records bounds are a condition in the others.
-_EVENT = 26
 #: The evidence of many rows tells half-widths so sharply that its own error, which adds up over the rows, must shrink
 #: with them; there is less left to integrate.
 _LONG = 2000
@@ -126,7 +133,7 @@ class Posterior:
     """
 
     method: Literal["ep", "sample"] = "ep"
-    nodes: int = 64
+    nodes: int = 128
     outliers: float | bool = False
     rounds: int = 20
     iterations: int = 200
@@ -229,7 +236,7 @@ class Posterior:
         `held` is what earlier windows handed on, `first` the number of the window's first row, which lies `drop` rows
         after that of the window before; skewness and kurtosis are asked for from stage `shaped` on.
         """
-        known = held.known(first)
+        known = held.known(first, len(record))
         if isinstance(model, Nonlinear):
             from halfwidth.methods._relinearise import relinearised
 
@@ -278,20 +285,23 @@ class Posterior:
             first = np.where(chain.free, start.s.clip(chain.floor, chain.cap), first)
         q = int(chain.free.sum()) + learn_rate
         limits = dict(_LIMITS)
-        limits["condition"] = max(0.0, 1.0 - _EVENT / max(len(chain.problem["start"]) - 2, 1))
+        limits["condition"] = condition(len(chain.problem["start"]) - 2) if known is None else 0.0  # `known` sees to it
         limits["again"] = min((len(chain.problem["start"]) - 2) // 8, _AGAIN)
         rows = max(float(chain.count.sum()), 1.0)
         limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
         limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
         if rows > _LONG:
             limits |= _OF_LONG
+        n = len(chain.problem["m0"])
+        room = int(_ROOM / (len(chain.problem["start"]) * n * (n + 3)))
+        count = 1 if q == 0 else min(self.nodes, max(room, _STAGE))
         if q == 0:
             limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
             limits |= _MIXED
         if chain.exact:
             limits["most"] = 1
-        found = self._learn(chain, model, first, start, drop, known, shaped, limits, self.nodes if q else 1)
+        found = self._learn(chain, model, first, start, drop, known, shaped, limits, count)
         if int(found["code"]) == 2 and q and self.nodes > 1:
             # A mode in the corner of its bounds may have no node inside them: then it stands alone.
             found = self._learn(chain, model, first, start, drop, known, shaped, limits, 1)
@@ -303,12 +313,12 @@ class Posterior:
         shaped: int, limits: dict[str, Any], count: int,
     ) -> dict[str, Any]:  # fmt: skip
         rate, learn_rate, beta = self._rate(model)
-        z, log_proposal = nodes(int(chain.free.sum()) + learn_rate, count)
+        z = nodes(int(chain.free.sum()) + learn_rate, count)
         return dict(
             _core.ep_learn(
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
                 chain.fitted, learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z,
-                log_proposal, limits, None if start is None else start.before, drop, shaped,
+                limits, None if start is None else start.before, drop, shaped,
                 None if known is None else known.pull, None if known is None else known.precision,
                 chain.outside if limits["condition"] > 0 else None,
             )
@@ -462,20 +472,37 @@ def _named(share: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
 
 
 @functools.lru_cache(maxsize=64)
-def nodes(q: int, count: int) -> tuple[Array, Array]:
-    """Return `count` points (count, q) of a t distribution with 10 degrees of freedom, and their log density (count,).
+def nodes(q: int, count: int) -> Array:
+    """Return `count` standard normal points (count, q), the same for every window.
 
-    They come in pairs z, -z from a fixed seed: the same for every window, and centred.
+    Each stage of them is a piece of one additive recurrence, in pairs z, -z, with the mean 0 and, where there are
+    enough of them, the covariance 1.
     """
     if count == 1 or q == 0:
-        return np.zeros((1, q)), np.zeros(1)
-    freedom = 10
-    rng = np.random.default_rng(20260)
-    half = (count + 1) // 2
-    z = rng.standard_normal((half, q)) * np.sqrt(freedom / rng.chisquare(freedom, half))[:, None]
-    z = np.concatenate([z, -z])[:count]
-    constant = math.lgamma(0.5 * (freedom + q)) - math.lgamma(0.5 * freedom) - 0.5 * q * math.log(freedom * math.pi)
-    return np.ascontiguousarray(z), constant - 0.5 * (freedom + q) * np.log1p((z**2).sum(axis=1) / freedom)
+        return np.zeros((1, q))
+    root = 2.0
+    for _ in range(64):
+        root = (1.0 + root) ** (1.0 / (q + 1))
+    normal = NormalDist()
+    found, at = [], 0
+    for size in _stages(count):
+        half = (size + 1) // 2
+        grid = (0.5 + np.outer(np.arange(at, at + half), root ** -np.arange(1.0, q + 1))) % 1.0
+        at += half
+        z = np.vectorize(normal.inv_cdf)(np.clip(grid, 1e-6, 1 - 1e-6))
+        if half > q:
+            z = np.linalg.solve(np.linalg.cholesky(z.T @ z / half), z.T).T
+        found.append(np.concatenate([z, -z])[:size])
+    return np.ascontiguousarray(np.concatenate(found))
+
+
+def _stages(count: int) -> list[int]:
+    """Return the sizes of the core's stages of so many nodes."""
+    sizes: list[int] = []
+    while count:
+        sizes.append(count if count < 2 * _STAGE or len(sizes) == _STAGES - 1 else _STAGE)
+        count -= sizes[-1]
+    return sizes
 
 
 def _diagonal(part: Gaussian) -> bool:
