@@ -66,6 +66,9 @@ _SIDE, _WIDE, _SHAPE, _RARE = 60.0, 10.0, 3, 2.2
 #: Errors that fade are looked for so long from a gap, s, and felt while they exceed the noise of a fix and this, m.
 _FADING, _FELT_M = 30.0, 0.05
 
+#: A gap that lacks a sensor for so long has no reckoning to see a fade by, s.
+_SILENT = 1.0
+
 #: Scale and bias are known to this many of their standard deviations, and no better than this.
 _KNOWN, _SCALE, _BIAS = 3.0, 0.003, 0.001
 
@@ -244,7 +247,7 @@ class _Search:
         again without those fixes.
         """
         for _ in range(2):
-            found = self._fading([doubt for doubt in doubts if self._beside(doubt).size >= _FEWEST])
+            found = self._fading([d for d in doubts if self._beside(d).size >= _FEWEST and not self._silent(d)])
             clearest: dict[int, _Doubt] = {}
             for doubt, wrong in found.items():
                 if doubt.gap not in clearest or wrong.clear > found[clearest[doubt.gap]].clear:
@@ -284,6 +287,12 @@ class _Search:
             if likely and wrong.clear - less > rival.get(doubt, 0.0) - _RARE:
                 better[doubt] = wrong
         return better
+
+    def _silent(self, doubt: _Doubt) -> bool:
+        """Return whether the gap lacks a sensor for a while: reckoning through it then says nothing about a fade."""
+        gap = slice(int(self.seen[doubt.gap - 1]) + 1, int(self.seen[doubt.gap]) + 1)
+        silent = (self.grid.speed_sd[gap] > 0) | (self.grid.yaw_rate_sd[gap] > 0)
+        return bool(self.grid.h[gap][silent].sum() > _SILENT)
 
     def _beside(self, doubt: _Doubt) -> NDArray[np.intp]:
         """Return the nodes of the fixes in which an error may fade away from a gap."""
