@@ -85,3 +85,11 @@ def test_where_reckoning_is_bad_no_fade_is_seen(data, begin, length):
     grid = sampled(log, sensors=known).without(begin, begin + length)
     times = grid.t[strays(grid, known).at]
     assert not ((times > begin - 30) & (times < begin + length + 30)).any()
+
+
+def test_through_a_gap_without_a_sensor_no_fade_is_seen(drive):
+    grid, sensors = drive
+    lost = (grid.t > GAP[0] + 5) & (grid.t < GAP[0] + 13)
+    wrong = np.where(lost, 0.5 * grid.speed, grid.speed)
+    assert strays(replace(grid, speed=wrong), sensors).at.size  # a wrong speed looks like wrong fixes
+    assert not strays(replace(grid, speed=wrong, speed_sd=np.where(lost, 0.5, grid.speed_sd)), sensors).at.size
