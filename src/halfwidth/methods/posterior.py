@@ -92,7 +92,8 @@ class Posterior:
         take linear models of uniform or Gaussian noise; ``info["rhat"]`` says whether the chains agree. Their prior of
         a half-width is the power alone, without `told`.
     nodes : int
-        Points over which unknown half-widths are integrated; 1 takes their mode as if it were the truth.
+        Most points over which unknown half-widths are integrated: no more are taken than what is left in doubt asks
+        for. 1 takes their mode as if it were the truth.
     outliers : float or bool
         Share of outputs that are outliers, whose noise is ten half-widths wide; True learns it. Each output noise needs
         a bounded part.
