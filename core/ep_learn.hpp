@@ -31,6 +31,7 @@ constexpr double ep_lean = 4.0;  // points that a first guess of their covarianc
 constexpr double ep_wide = 1.15;  // by how much a stage reaches farther than the posterior is thought to
 constexpr double ep_some = 10.0;  // effective points without which the evidence itself is in doubt
 constexpr int ep_few = 2;     // rows that may come or go while the mode stays
+constexpr double ep_apart = 1.0;  // disagreement of moments, in standard deviations, beyond which no step is taken
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
 template <class N>
@@ -442,7 +443,9 @@ struct EpLearner {
             evaluate_inside(at, begin == afresh ? a.many : a.few, 0.3 * a.tol, value, slope, begin, *best == minus_inf);
             double may = 0.05 * q;
             for (int j = 0; j < q; j++) may += 2.0 * a.reference * std::fabs(d[j]);
-            if (!(value[0] - log_told(0) > kept_value - may) && refused < 6) {  // too far, or no trajectory fits
+            // too far, or no trajectory fits: where moments run apart the evidence says nothing
+            const bool lost = !(value[0] > minus_inf) || (*best > minus_inf && !(f.residual[0] < ep_apart));
+            if ((lost || !(value[0] - log_told(0) > kept_value - may)) && refused < 6) {
                 refused++;
                 if (*best == minus_inf) {  // the start itself: wider half-widths fit more
                     for (int j = 0; j < q; j++) phi[j] = min2(max2(phi[j] + (group[j] >= 0 ? 0.7 : 0.0), lo[j]), hi[j]);
@@ -454,7 +457,7 @@ struct EpLearner {
                 }
                 continue;
             }
-            if (value[0] == minus_inf) return 2;
+            if (lost) return 1;  // stays where it was
             refused = 0;
             *best = value[0];
             kept_value = value[0] - log_told(0);
