@@ -173,7 +173,7 @@ int learn_any(const EpLearnArgs& a) {
 // numbers that taking over and handing on need, in whole registers
 std::size_t handover_size(const EpLearnArgs& a) {
     const std::size_t p = a.base.groups, n = a.base.n;
-    const std::size_t size = 5 * p * (p + 1) + a.nodes * (2 * learner_parameters(a) + 2) + 4 * n * n + 2 * n;
+    const std::size_t size = 6 * p * (p + 1) + a.nodes * (2 * learner_parameters(a) + 2) + 4 * n * n + 2 * n;
     return (size + wide_lanes - 1) / wide_lanes * wide_lanes;
 }
 
@@ -199,7 +199,10 @@ int ep_learn(const EpLearnArgs& given) {
     double* rest = work;
     if (a.pull) {
         rest = work + p * (p + 1);
-        ep_known(p, a.free, given.pull, given.precision, work, work + p, rest);
+        double *whole = rest, *whole_precision = whole + p;  // the power to second order
+        ep_with_power(given, 1.0, given.pull, given.precision, whole, whole_precision);
+        ep_known(p, a.free, whole, whole_precision, work, work + p, whole + p * (p + 1));
+        ep_with_power(given, -1.0, work, work + p, work, work + p);
         a.pull = work;
         a.precision = work + p;
     }

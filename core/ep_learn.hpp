@@ -3,7 +3,7 @@
 // phi = log s of the free half-widths, logit eps last if it is learned. The prior of a rate is a beta law. That of log s is
 // s^power told^reference on (floor, cap), told^2 = mean over the rows of (1 - posterior variance / (s^2 / 3))^2: the square
 // root of what a row tells of log s (Jeffreys) and a power, 0 where the noise drowns and steady where it is seen. It has
-// no scale of its own. What other data have told is a term pull'u - u'precision u / 2 beside it, u = s^warp.
+// no scale of its own. What other data have told is a factor s^known_power exp(pull's - s'precision s / 2) beside it.
 // log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the lanes one holds phi, the others
 // phi + h e_j, whose slopes give columns of the Hessian, other coordinates at the next step where there are more
 // coordinates than lanes. Then points are evaluated, `stage` by `stage`: the first stage around the mode with the
@@ -93,9 +93,8 @@ struct EpLearner {
                              : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi[j]));
     }
 
-    // What is known already of the half-widths: its logarithm up to a constant, its slope in log s_j, and minus the
-    // curvature of the Gaussian in it.
-    double power_of(int j, const double* phi) const { return std::exp(a.warp * phi[j]); }
+    // What is known already of the half-widths: its logarithm up to a constant, its slope in log s_j, and minus its
+    // curvature in s times s_i s_j.
     double precision(int i, int j) const { return a.precision[group[i] * a.base.groups + group[j]]; }
     double known(const double* phi) const {
         double p = 0.0;
@@ -104,8 +103,8 @@ struct EpLearner {
                 if (group[i] >= 0) {
                     double half = a.pull[group[i]];
                     for (int j = 0; j < q; j++)
-                        if (group[j] >= 0) half -= 0.5 * precision(i, j) * power_of(j, phi);
-                    p += half * power_of(i, phi);
+                        if (group[j] >= 0) half -= 0.5 * precision(i, j) * std::exp(phi[j]);
+                    p += half * std::exp(phi[i]) + a.known_power[group[i]] * phi[i];
                 }
         return p;
     }
@@ -113,12 +112,12 @@ struct EpLearner {
         if (!a.pull) return 0.0;
         double d = a.pull[group[i]];
         for (int j = 0; j < q; j++)
-            if (group[j] >= 0) d -= precision(i, j) * power_of(j, phi);
-        return a.warp * power_of(i, phi) * d;
+            if (group[j] >= 0) d -= precision(i, j) * std::exp(phi[j]);
+        return std::exp(phi[i]) * d + a.known_power[group[i]];
     }
     double known_curve(int i, int j, const double* phi) const {
         if (!a.pull || group[i] < 0 || group[j] < 0) return 0.0;
-        return a.warp * a.warp * power_of(i, phi) * power_of(j, phi) * precision(i, j);
+        return std::exp(phi[i] + phi[j]) * precision(i, j) + (i == j ? a.known_power[group[i]] : 0.0);
     }
 
     // parameters of lane l

@@ -58,23 +58,24 @@ def condition(rows: float) -> float:
 
 
 class Known(NamedTuple):
-    """What is known of half-widths (q, r): the logarithm pull' u - u' precision u / 2 in u = s^(1/2)."""
+    """What is known of half-widths s = (q, r): a factor s^power exp(pull' s - s' precision s / 2)."""
 
     pull: Array
     precision: Array
+    power: Array
 
     @classmethod
     def none(cls, p: int) -> "Known":
         """Nothing is known of p half-widths."""
-        return cls(np.zeros(p), np.zeros((p, p)))
+        return cls(np.zeros(p), np.zeros((p, p)), np.zeros(p))
 
     def plus(self, other: "Known", weight: float = 1.0) -> "Known":
         """Add what other rows told."""
-        return Known(self.pull + weight * other.pull, self.precision + weight * other.precision)
+        return Known(*(own + weight * more for own, more in zip(self, other, strict=True)))
 
     def times(self, weight: float) -> "Known":
         """Return it weighted."""
-        return Known(weight * self.pull, weight * self.precision)
+        return Known(*(weight * own for own in self))
 
 
 def inside(chain: Sites, s: Array) -> Known:
@@ -92,11 +93,10 @@ def inside(chain: Sites, s: Array) -> Known:
     column = (g[1 : q + 1] - g[q + 1 :]) / (2.0 * h)
     if not (np.isfinite(found["log_z"]).all() and np.isfinite(column).all() and (found["worst"] > _WORST).all()):
         return known
-    u = s[free] ** WARP
-    slope = g[0] / (WARP * u)
-    H = -(0.5 * (column + column.T) - np.diag(WARP * g[0])) / (WARP**2 * u[:, None] * u)
+    s = s[free]
+    H = -(0.5 * (column + column.T) - np.diag(g[0])) / (s[:, None] * s)
     known.precision[np.ix_(free, free)] = H
-    known.pull[free] = slope + H @ u
+    known.pull[free] = g[0] / s + H @ s
     return known
 
 

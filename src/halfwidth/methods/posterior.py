@@ -320,7 +320,7 @@ class Posterior:
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
                 chain.fitted, learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z,
                 limits, None if start is None else start.before, drop, shaped,
-                None if known is None else known.pull, None if known is None else known.precision,
+                *((None, None, None) if known is None else known),
                 chain.outside if limits["condition"] > 0 else None,
             )
         )  # fmt: skip
@@ -448,7 +448,7 @@ class Answer(NamedTuple):
     @property
     def told(self) -> Known:
         """What its rows tell of the half-widths."""
-        return Known(self.found["told_pull"], self.found["told_precision"])
+        return Known(*(self.found[name] for name in ("told_pull", "told_precision", "told_power")))
 
 
 @functools.lru_cache(maxsize=64)
