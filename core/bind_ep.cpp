@@ -413,14 +413,15 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     return found;
 }
 
-nb::tuple known(InBool free, In pull, In precision) {
+nb::tuple known(InBool free, In start, In pull, In precision, In power) {
     const std::size_t p = free.size();
-    want(pull.size() == p && precision.size() == p * p, "pull (p,), precision (p,p)");
-    double *h = nullptr, *H = nullptr;
-    nb::object found_h = fresh({p}, &h), found_H = fresh({p, p}, &H);
-    Work work(4 * p * (p + 1));
-    HW_PICK_WIDE(ep_known_part)(static_cast<int>(p), free.data(), pull.data(), precision.data(), h, H, work.p);
-    return nb::make_tuple(found_h, found_H);
+    want(start.size() == p && pull.size() == p && precision.size() == p * p && power.size() == p,
+         "start, pull, power (p,), precision (p,p)");
+    double *h = nullptr, *H = nullptr, *g = nullptr;
+    nb::object found_h = fresh({p}, &h), found_H = fresh({p, p}, &H), found_g = fresh({p}, &g);
+    Work work(5 * p * (p + 1));
+    HW_PICK_WIDE(ep_known_part)(static_cast<int>(p), free.data(), start.data(), pull.data(), precision.data(), power.data(), h, H, g, work.p);
+    return nb::make_tuple(found_h, found_H, found_g);
 }
 
 }  // namespace
@@ -428,7 +429,7 @@ nb::tuple known(InBool free, In pull, In precision) {
 void bind_ep(nb::module_& mod) {
     mod.def("ep_run", &run, "problem"_a, "s"_a, "eps"_a, "sweeps"_a, "tol"_a, "damping"_a, "sites"_a.none(),
             "Expectation propagation on a chain for given half-widths, one set a member; see core/ep_entry.hpp.");
-    mod.def("ep_known", &known, "free"_a, "pull"_a, "precision"_a,
+    mod.def("ep_known", &known, "free"_a, "start"_a, "pull"_a, "precision"_a, "power"_a,
             "What is known of the free half-widths alone, whatever the others are; see core/ep_handover.hpp.");
     mod.def("ep_learn", &learn, "problem"_a, "free"_a, "floor"_a, "cap"_a, "scale"_a, "start"_a, "count"_a,
             "squared"_a, "learn_eps"_a,

@@ -1,7 +1,7 @@
 // What a solved window of a stream takes over from the one before, and what it hands on: plain numbers, no lanes.
 //
 // Half-widths: what other rows told of them is a factor s^power exp(pull's - s'precision s / 2) over all of them, of which
-// a window takes the part of its free ones (`ep_known`). What its own rows tell (`ep_told`) has
+// a window takes the part of its free ones (`ep_taken`). What its own rows tell (`ep_told`) has
 //
 //     precision = -Cov(g - power / s, s) Cov(s)^-1,    pull = E (g - power / s) + precision E s,    g = d log Z / ds,
 //
@@ -128,14 +128,28 @@ inline void ep_known(int p, const bool* free, const double* pull, const double* 
     }
 }
 
-// to_pull (groups,), to_precision (groups,groups) = from + sign times the power, to second order in s about the start
-inline void ep_with_power(const EpLearnArgs& a, double sign, const double* pull, const double* precision, double* to_pull,
-                          double* to_precision) {
-    const int p = a.base.groups;
+// What a window takes of what is known of p half-widths: found_pull (p,), found_precision (p,p), found_power (p,). It is made
+// proper with the powers to second order in s about the start (p,); one stays a power where a falling Gaussian is left
+// beside it. work (5 p (p + 1))
+inline void ep_taken(int p, const bool* free, const double* start, const double* pull, const double* precision, const double* power,
+                     double* found_pull, double* found_precision, double* found_power, double* work) {
+    double *whole = work, *whole_precision = whole + p;
+    const auto curve_of = [&](int i) {
+        const double curve = power[i] / (start[i] * start[i]);
+        return free[i] && power[i] > 0.0 && finite(curve) ? curve : 0.0;
+    };
     for (int i = 0; i < p; i++) {
-        const double more = a.free[i] && a.known_power[i] > 0.0 ? sign * a.known_power[i] / a.start[i] : 0.0;
-        to_pull[i] = pull[i] + 2.0 * more;
-        for (int j = 0; j < p; j++) to_precision[i * p + j] = precision[i * p + j] + (i == j && more != 0.0 ? more / a.start[i] : 0.0);
+        whole[i] = pull[i] + 2.0 * curve_of(i) * start[i];
+        for (int j = 0; j < p; j++) whole_precision[i * p + j] = precision[i * p + j] + (i == j ? curve_of(i) : 0.0);
+    }
+    ep_known(p, free, whole, whole_precision, found_pull, found_precision, work + p * (p + 1));
+    for (int i = 0; i < p; i++) {
+        found_power[i] = 0.0;
+        const double curve = curve_of(i), left = found_precision[i * p + i] - curve;
+        if (!(curve > 0.0 && left >= 0.0)) continue;
+        found_power[i] = power[i];
+        found_precision[i * p + i] = left;
+        found_pull[i] -= 2.0 * curve * start[i];
     }
 }
 

@@ -38,7 +38,7 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
-from halfwidth.methods._carry import HANDED_ON, WARP, Carried, Known, Start, condition
+from halfwidth.methods._carry import HANDED_ON, Carried, Known, Start, condition
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Frame, Sites, gaussian_part, sites, uniform_part, unknowns
 from halfwidth.model import Linear, Model, Nonlinear
@@ -48,9 +48,11 @@ from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box, Normal, Shaped
 
 #: Power of the half-widths' prior; see above.
-POWER = 0.5
+POWER = 0.35
 #: Nodes of a stage, and most stages (core/ep_learn.hpp).
 _STAGE, _STAGES = 16, 8
+#: Power of a half-width in which its posterior is nearly Gaussian: 0 is no tail there.
+WARP = 0.5
 #: Numbers that the beliefs of all nodes may take up; one stage is always had.
 _ROOM = 4e6
 #: Of the search and the nodes. The mode of the window before is a good centre of nodes up to the distance `near`, in
