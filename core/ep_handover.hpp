@@ -5,8 +5,8 @@
 //
 //     precision = -Cov(g - power / s, s) Cov(s)^-1,    pull = E (g - power / s) + precision E s,    g = d log Z / ds,
 //
-// the moments being those of the posterior over s, the weighted nodes, and power_j >= 0 by regression of g_j on s and
-// 1 / s_j. A half-width that is well seen has a power and next to no precision, one that drowns in the others no power: it
+// the moments being those of the posterior over s, the weighted nodes, and power_j by regression of g_j on s and 1 / s_j, no
+// less than 0 and no more than leaves a Gaussian that falls. A half-width that is well seen has a power and next to no precision, one that drowns in the others no power: it
 // is felt through its variance, s^2. So what windows tell whose posterior is wide is true where later ones find it.
 // What log Z lacks to second order has no slope of its own: pull gets that of a line through the nodes,
 // Cov(s)^-1 Cov(s, second).
@@ -299,18 +299,19 @@ inline void ep_told(const EpLearnArgs& a, int q, double* work) {
         ldl(Dim<0>(f), S, L, pivot, inverse);
         for (int i = 0; i < f * f; i++) B[i] = Y[i];
         ldl_solve(Dim<0>(f), Dim<0>(f), L, inverse, B);
-        for (int j = 0; j < f; j++) {
+        ldl_solve(Dim<0>(f), Dim<0>(f), L, inverse, X);
+        for (int j = 0; j < f && sound >= 2 * f + 4; j++) {
             double left = own[j], felt = with[j];  // of what no line in s explains
             for (int i = 0; i < f; i++) {
                 left -= Y[i * f + j] * B[i * f + j];
-                felt -= X[i * f + j] * B[i * f + j];
+                felt -= Y[i * f + j] * X[i * f + j];
             }
-            if (!(left > ep_bent * own[j] && felt > 0.0)) continue;
-            power[j] = felt / left;
+            const double falls = X[j * f + j] / B[j * f + j];  // a power that leaves no Gaussian beside it
+            if (!(left > ep_bent * own[j] && felt > 0.0 && falls > 0.0 && B[j * f + j] < 0.0)) continue;
+            power[j] = min2(felt / left, falls);
             level[j] -= power[j] * over[j];
-            for (int i = 0; i < f; i++) X[i * f + j] -= power[j] * Y[i * f + j];
+            for (int i = 0; i < f; i++) X[i * f + j] -= power[j] * B[i * f + j];
         }
-        ldl_solve(Dim<0>(f), Dim<0>(f), L, inverse, X);
         ldl_solve(Dim<0>(f), Dim<1>(), L, inverse, more);
         for (int i = 0; i < f; i++)
             for (int j = 0; j < f; j++) H[i * f + j] = -0.5 * (X[i * f + j] + X[j * f + i]);

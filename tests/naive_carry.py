@@ -61,8 +61,9 @@ def told(free, found, before=None):
             line = np.linalg.solve(S, ds.T @ (w * over))
             left, felt = w @ over**2 - (ds.T @ (w * over)) @ line, w @ (over * (g[:, j] - w @ g[:, j]))
             felt -= (ds.T @ (w * (g[:, j] - w @ g[:, j]))) @ line
-            if left > 1e-3 * (w @ over**2) and felt > 0:
-                power[f[j]] = felt / left
+            own = np.linalg.solve(S, ds.T @ (w * (g[:, j] - w @ g[:, j])))[j]
+            if len(s) >= 2 * q + 4 and left > 1e-3 * (w @ over**2) and felt > 0 and own < 0 and line[j] < 0:
+                power[f[j]] = min(felt / left, own / line[j])
         g = g - power[f] / s
         level = w @ g
         H = -np.linalg.solve(S, (w[:, None] * ds).T @ (g - level))

@@ -48,7 +48,7 @@ from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box, Normal, Shaped
 
 #: Power of the half-widths' prior; see above.
-POWER = 0.35
+POWER = 0.4
 #: Nodes of a stage, and most stages (core/ep_learn.hpp).
 _STAGE, _STAGES = 16, 8
 #: Power of a half-width in which its posterior is nearly Gaussian: 0 is no tail there.
