@@ -6,14 +6,14 @@ window i is, about its posterior, a power beside a Gaussian,
     log Z_i(s) ~ sum_j power_ij log s_j + pull_i' s - s' H_i s / 2,
     H_i = -Cov(g - power_i / s, s) Cov(s)^-1,    pull_i = E (g - power_i / s) + H_i E s,
 
-where g is the slope of log Z_i in s, power_ij >= 0 what g_j has along 1 / s_j beside a line, and the moments are
-those of the posterior over s (the nodes of `Posterior`). A half-width that is well seen leaves a power and a falling
-line; one that drowns in other noise is felt through s^2 and leaves a parabola about 0. A quadratic in log s or
-s^(1/2) fits the first alone: early windows, whose posterior is wide, would make the second smaller than it is. A row
-lies in as many windows as a window has rows, N: each window counts 1 / N, and only once **all** of its rows have left, so
-no row speaks twice and the prior of the newest window holds none of its own data. The sum of overlapping window
-likelihoods is a composite likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by
-exp(-1 / rows) a row.
+where g is the slope of log Z_i in s, power_ij >= 0 what g_j has along 1 / s_j beside a line, and the moments are those
+of the posterior over s (the nodes of `Posterior`). A half-width that is well seen leaves a power and a falling line;
+one that drowns in other noise is felt through s^2 and leaves a parabola about 0. A quadratic in log s or s^(1/2) fits
+the first alone: early windows, whose posterior is wide, would make the second smaller than it is. A row lies in as
+many windows as a window has rows, N: each window counts 1 / N, and only once **all** of its rows have left, so no row
+speaks twice and the prior of the newest window holds none of its own data. The sum of overlapping window likelihoods
+is a composite likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by exp(-1 / rows)
+a row.
 
 As a factor of the evidence bounds count as an event that small half-widths make likely, and over many windows that adds
 up. So they are a condition in all rows but 26, those of the newest window and those that have left alike
