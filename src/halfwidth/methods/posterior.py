@@ -95,7 +95,7 @@ class Posterior:
         a half-width is the power alone, without `told`.
     nodes : int
         Most points over which unknown half-widths are integrated: no more are taken than what is left in doubt asks
-        for. 1 takes their mode as if it were the truth.
+        for, and no fewer than six and two for each unknown. 1 takes their mode as if it were the truth.
     outliers : float or bool
         Share of outputs that are outliers, whose noise is ten half-widths wide; True learns it. Each output noise needs
         a bounded part.
@@ -297,7 +297,7 @@ class Posterior:
             limits |= _OF_LONG
         n = len(chain.problem["m0"])
         room = int(_ROOM / (len(chain.problem["start"]) * n * (n + 3)))
-        count = 1 if q == 0 else min(self.nodes, max(room, _STAGE))
+        count = 1 if q == 0 or self.nodes == 1 else max(min(self.nodes, max(room, _STAGE)), 2 * q + 6)
         if q == 0:
             limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
