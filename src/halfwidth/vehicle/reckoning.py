@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth import _core
-from halfwidth.vehicle.grid import DRIFT, Grid, means, silence
+from halfwidth.vehicle.grid import DRIFT, Grid, bridged, means, silence
 from halfwidth.vehicle.pointing import azimuth_of
 
 Floats = NDArray[np.float64]
@@ -210,7 +210,7 @@ def _steps(grid: Grid, streams: Streams, clock: Floats, still: NDArray[np.bool_]
     h = grid.h
 
     def mean(name: str, offset: float) -> Floats:
-        t, values = streams[name]
+        t, values = streams[name] if name == "speed" else bridged(*streams[name])
         return means(grid.t, t + offset, values)
 
     def lost(name: str, offset: float) -> Floats:
