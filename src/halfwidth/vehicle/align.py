@@ -4,9 +4,10 @@ The fixes are the reference. Units and signs come first, as they are factors tha
 clock of each stream is looked for roughly, by sliding it along what fixes a second or a few apart show of it, and then
 finely by dead reckoning (`reckoning`), piece by piece of some minutes. The pieces are independent, so their information
 adds up, and their scatter about the common answer says whether it can be believed: standard deviations are widened by
-it where it is larger than they say, a clock that stepped or drifts shows as pieces that disagree in order of time, and
-an offset that stays vague is called not observable and not applied. A wrong clock poisons scale and bias, so all of
-them are unknowns of one problem.
+it where it is larger than they say, a clock that drifts shows as pieces that disagree in order of time, and an offset
+that stays vague is called not observable and not applied. A clock that steps shows already in the rough look, where two
+offsets, one before and one after, fit much better than one: the drive is cut there. A wrong clock poisons scale and
+bias, so all of them are unknowns of one problem.
 """
 
 from collections.abc import Sequence
@@ -44,8 +45,18 @@ STANDING, EDGE, SHORTEST = 0.1, 1.0, 1.0
 #: The bias is told every so many seconds.
 KNOT = 30.0
 
+#: Two offsets, one before and one after some time, are looked at closer if they raise the log-likelihood of the rough
+#: look by this much; so much of the drive must lie on either side, and cuts are tried so far apart, s.
+STEP_HOPE, STEP_SIDE, STEP_APART = 4.0, 15.0, 1.0
+
 #: A change of a clock is believed if it makes the misfit of the pieces smaller by this much, and is this large, s.
 CHANGE_GAIN, CHANGE_LEAST = 25.0, 0.05
+
+#: The same for a step that the rough look saw.
+SEEN_GAIN = 9.0
+
+#: How long after each other the courses lie that are compared with the yaw rate, s.
+_TURN = 5.0
 
 #: Rounds with the antenna on the axle, then off it.
 _ROUNDS, _MORE = 12, 6
@@ -80,7 +91,8 @@ def calibrated(log: Log, *, clock_offset: float | None = None) -> Calibration:
     start = {name: Offset(seconds, 0.0, True) for name, seconds in first.items()}
     known = replace(known, still=standstills(log, replace(known, offsets=start)))
     grid = sampled(log)
-    parts = _parts(grid)
+    cut = None if given.given else rough.cut()
+    parts = _parts(grid, cut)
     plain = replace(known, offsets={}, still=AS_LOGGED.still)
     streams: reckoning.Streams = {name: plain.stream(log, name) for name in _SENSORS}
     if "speed" not in there:
@@ -89,12 +101,12 @@ def calibrated(log: Log, *, clock_offset: float | None = None) -> Calibration:
     pieces = [piece for piece in solved if piece.sound]
     if not pieces:
         return known
-    known = _joined(known, pieces, there, given)
-    rolled = _wheels(log, parts, streams, known, solved, given)
+    known = _joined(known, pieces, there, given, cut)
+    rolled = _wheels(log, parts, streams, known, solved, given, cut)
     if rolled is not None:
         known, streams, solved = rolled
         pieces = [piece for piece in solved if piece.sound]
-    off = _antenna(parts, streams, known, solved, given)
+    off = _antenna(parts, streams, known, solved, given, cut)
     if off is not None:
         known = off
     known = _azimuth(log, known, pieces)
@@ -184,6 +196,7 @@ class _Rough:
     lags: Floats  # (L,)
     when: dict[str, Floats]  # middle of each window
     misfit: dict[str, Floats]  # (windows, L)
+    span: dict[str, float]  # of each window, s
 
     @classmethod
     def of(cls, log: Log, known: Calibration) -> "_Rough":
@@ -193,6 +206,7 @@ class _Rough:
         when, misfit = {}, {}
         plain = replace(known, offsets={})
         span = max(1.0, usual)
+        spans = {"speed": span, "yaw_rate": _TURN}
         chord = evidence.windows(log, span)
         middle, took = 0.5 * (chord.start + chord.stop), chord.stop - chord.start
         t, v = plain.stream(log, "speed")
@@ -211,7 +225,7 @@ class _Rough:
         if t.size > 2 and middle.size > 2:
             moving = chord.distance > np.maximum(2.0, 1.0 * took)
             at, course = middle[moving], chord.course[moving]
-            later = np.searchsorted(at, at + 5.0)
+            later = np.searchsorted(at, at + _TURN)
             there = later < at.size
             there[there] &= at[later[there]] - at[there] < 8.0
             a, b = at[there], at[later[there]]
@@ -219,32 +233,82 @@ class _Rough:
             found = np.stack([-evidence.integral(t + lag, w, a, b) for lag in lags], 1)
             when["yaw_rate"] = 0.5 * (a + b)
             misfit["yaw_rate"] = np.abs(wrapped(found - turned[:, None]))
-        return cls(lags, when, misfit)
+        return cls(lags, when, misfit, spans)
 
     def offset(self, name: str, start: float = -np.inf, stop: float = np.inf) -> float:
         """Return the offset that fits best between two times, 0 where none is clearly better than none, s."""
         if name not in self.misfit:
             return 0.0
         inside = (self.when[name] >= start) & (self.when[name] <= stop)
-        rows = self.misfit[name][inside]
-        rows = rows[np.isfinite(rows).all(axis=1)]
+        rows = self._capped(name)[1] if inside.all() else _capped(self.misfit[name][inside])
         if len(rows) < FEWEST:
             return 0.0
-        # what no offset explains is not counted more than what the best one explains badly
-        cap = 4.0 * max(float(np.median(rows.min(axis=1))), float(np.median(rows)), 1e-6)
-        cost = np.minimum(rows, cap).mean(axis=0)
+        cost = rows.mean(axis=0)
         k = int(np.argmin(cost))
         none = float(np.interp(0.0, self.lags, cost))
         return float(self.lags[k]) if cost[k] < 0.9 * none else 0.0
+
+    def cut(self) -> float | None:
+        """Return when the clocks step, s; None where one offset for the whole drive explains it about as well.
+
+        Misfits are taken for Laplace's, as their absolute values are what is minimised, and windows that overlap count
+        as one. Both streams are asked together: they mostly come by the same logger.
+        """
+        found = [self._likely(name) for name in self.misfit]
+        found = [(when, loglik) for when, loglik in found if len(when) >= FEWEST]
+        if not found:
+            return None
+        first, last = min(when[0] for when, _ in found), max(when[-1] for when, _ in found)
+        cuts = np.arange(first + STEP_SIDE, last - STEP_SIDE, STEP_APART)
+        if cuts.size == 0:
+            return None
+        gain = np.zeros(cuts.size)
+        for when, loglik in found:
+            before = loglik[np.searchsorted(when, cuts)]
+            gain += before.max(axis=1) + (loglik[-1] - before).max(axis=1) - loglik[-1].max()
+        if gain.max() <= STEP_HOPE:
+            return None
+        # where nothing tells when, as in a gap, the middle is never far off
+        alike = np.flatnonzero(gain > gain.max() - 0.5)
+        same = np.cumsum(np.diff(alike, prepend=alike[0]) > 1)
+        best = same[np.searchsorted(alike, np.argmax(gain))]
+        return float(cuts[alike[same == best]].mean())
+
+    def _likely(self, name: str) -> tuple[Floats, Floats]:
+        """Return the times (n,) of the windows of a stream and, for each offset, the log-likelihood up to each."""
+        when, rows = self._capped(name)
+        if len(rows) < FEWEST:
+            return when, np.zeros((1, self.lags.size))
+        size = max(float(rows.mean(axis=0).min()), 1e-9)
+        overlap = max(1.0, self.span[name] / max(float(np.median(np.diff(when))), 1e-9))
+        return when, -np.concatenate((np.zeros((1, self.lags.size)), np.cumsum(rows, axis=0))) / (size * overlap)
+
+    def _capped(self, name: str) -> tuple[Floats, Floats]:
+        """Return the times and misfits of the windows in which every offset can be judged."""
+        whole = np.isfinite(self.misfit[name]).all(axis=1)
+        return self.when[name][whole], _capped(self.misfit[name])
+
+
+def _capped(rows: Floats) -> Floats:
+    """Return misfits (windows, L) of whole windows; what no offset explains counts no more than what the best one does.
+
+    The cap is four times what is usual.
+    """
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if not len(rows):
+        return rows
+    return np.minimum(rows, 4.0 * max(float(np.median(rows.min(axis=1))), float(np.median(rows)), 1e-6))
 
 
 # ---- piece by piece ------------------------------------------------------------------------------------------------
 
 
-def _parts(grid: Grid) -> list[Grid]:
-    """Cut a drive into pieces in which there is something to see, evenly spread if there are many."""
-    ends = np.flatnonzero(np.diff(grid.t[grid.seen]) > PAUSE)
+def _parts(grid: Grid, cut: float | None) -> list[Grid]:
+    """Cut a drive into pieces in which there is something to see, evenly spread if many; none passes `cut`."""
     fixes = grid.t[grid.seen]
+    ends = np.flatnonzero(np.diff(fixes) > PAUSE)
+    if cut is not None and fixes[0] < cut < fixes[-1]:
+        ends = np.union1d(ends, int(np.searchsorted(fixes, cut)) - 1)
     blocks = zip(np.concatenate(([0], ends + 1)), np.concatenate((ends, [fixes.size - 1])), strict=True)
     parts = []
     for a, b in blocks:
@@ -303,16 +367,21 @@ def _still(part: Grid, known: Calibration) -> NDArray[np.bool_]:
 # ---- all pieces together -------------------------------------------------------------------------------------------
 
 
-def _joined(known: Calibration, pieces: Sequence[reckoning.Piece], there: Sequence[str], given: Offset) -> Calibration:
+def _joined(
+    known: Calibration, pieces: Sequence[reckoning.Piece], there: Sequence[str], given: Offset, cut: float | None
+) -> Calibration:
     """Add up what the pieces say; find out whether a clock changes."""
     mean, sd, spread = _together(pieces)
-    offsets = {}
-    for name in there:
-        k = 1 + _SENSORS.index(name)
-        if given.given:
-            offsets[name] = given
-        else:
-            offsets[name] = _offset(pieces, k, float(mean[k]), float(sd[k] * max(1.0, spread[k])))
+    offsets = dict.fromkeys(there, given)
+    if not given.given:
+        for name in there:
+            k = 1 + _SENSORS.index(name)
+            size = float(sd[k] * max(1.0, spread[k]))
+            offsets[name] = _offset(pieces, k, Offset(float(mean[k]), size, size < OBSERVABLE), cut)
+        stepping = next((one for one in offsets.values() if one.change == "step"), None)
+        for name, one in offsets.items():
+            if stepping is not None and one.change == "":
+                offsets[name] = _alike(pieces, 1 + _SENSORS.index(name), one, stepping)
     bias = np.array([piece.bias.mean() for piece in pieces])
     # a bias drifts: the pieces count by how long they are sure of it, not by how sure
     variance = np.array([piece.bias_sd**2 for piece in pieces])
@@ -366,16 +435,19 @@ def _marginal(piece: reckoning.Piece) -> Floats:
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(piece.information + np.diag(reckoning.PRIOR**-2.0)))))
 
 
-def _offset(pieces: Sequence[reckoning.Piece], k: int, mean: float, sd: float) -> Offset:
-    """Return an offset of one stream: the same for the drive, or stepping or drifting if the pieces say so."""
+def _offset(pieces: Sequence[reckoning.Piece], k: int, constant: Offset, cut: float | None) -> Offset:
+    """Return an offset of one stream: the same for the drive, or stepping or drifting if the pieces say so.
+
+    Few pieces cannot say how much they scatter: they are only asked about a step at `cut`, which the rough look saw.
+    """
     value = np.array([piece.mean[k] for piece in pieces])
     own = np.array([_marginal(piece)[k] for piece in pieces])
     sure = own < 0.5 * reckoning.PRIOR[k]
-    constant = Offset(mean, sd, bool(sd < OBSERVABLE))
-    if sure.sum() < 4:
-        return constant
-    t = np.array([piece.t.mean() for piece in pieces])[sure]
     ends = np.array([(piece.t[0], piece.t[-1]) for piece in pieces])[sure]
+    t = np.array([piece.t.mean() for piece in pieces])[sure]
+    seen = cut is not None and bool((t < cut).any() and (t > cut).any())
+    if t.size < 4 and not seen:
+        return constant
     value, own = value[sure], np.maximum(own[sure], 0.01)
 
     def misfit(columns: Floats) -> tuple[float, Floats]:
@@ -385,22 +457,44 @@ def _offset(pieces: Sequence[reckoning.Piece], k: int, mean: float, sd: float) -
     ones = np.ones(t.size)
     flat, _ = misfit(ones[:, None])
     line, slope = misfit(np.column_stack((ones, t - t.mean())))
-    cuts = range(1, t.size)
-    tried = [misfit(np.column_stack((np.arange(t.size) < c, np.arange(t.size) >= c)).astype(float)) for c in cuts]
-    cut = int(np.argmin([found[0] for found in tried])) + 1
-    step, levels = tried[cut - 1]
-    best = min(line, step)
+    between = (ends[:-1, 1] + ends[1:, 0]) / 2 if not seen else np.array([cut])
+    tried = [misfit(np.column_stack((t < when, t >= when)).astype(float)) for when in between]
+    best_cut = int(np.argmin([found[0] for found in tried]))
+    step, levels = tried[best_cut]
+    best = step if t.size < 4 else min(line, step)
     noise = max(1.0, best / max(t.size - 2, 1))
-    if (flat - best) / noise < CHANGE_GAIN:
+    if (flat - best) / noise < (SEEN_GAIN if seen else CHANGE_GAIN):
         return constant
-    if step < line - noise and abs(levels[1] - levels[0]) > CHANGE_LEAST:
-        between = (ends[cut - 1, 1] + ends[cut, 0]) / 2
-        at = ((between - 1e-3, float(levels[0])), (between, float(levels[1])))
-        return Offset(mean, sd, True, at, "step")
-    if abs(slope[1]) * np.ptp(t) > CHANGE_LEAST:
+    if (t.size < 4 or step < line - noise) and abs(levels[1] - levels[0]) > CHANGE_LEAST:
+        when = float(between[best_cut])
+        sides = [float(np.sum(own[side] ** -2.0) ** -0.5) for side in (t < when, t >= when)]
+        at = ((when - 1e-3, float(levels[0])), (when, float(levels[1])))
+        return Offset(constant.seconds, float(max(sides) * np.sqrt(noise)), True, at, "step")
+    if t.size >= 4 and abs(slope[1]) * np.ptp(t) > CHANGE_LEAST:
         first, last = ((float(x), float(slope[0] + slope[1] * (x - t.mean()))) for x in (ends[0, 0], ends[-1, 1]))
-        return Offset(float(slope[0]), sd, True, (first, last), "drift")
+        return Offset(float(slope[0]), constant.sd, True, (first, last), "drift")
     return constant
+
+
+def _alike(pieces: Sequence[reckoning.Piece], k: int, constant: Offset, other: Offset) -> Offset:
+    """Return an offset that steps like that of the other stream if the pieces do not prefer one that does not.
+
+    Streams mostly share a logger, and both explanations have one unknown.
+    """
+    (_, before), (when, after) = other.at
+    value = np.array([piece.mean[k] for piece in pieces])
+    weight = np.array([_marginal(piece)[k] ** -2.0 for piece in pieces])
+    late = np.where(np.array([piece.t.mean() for piece in pieces]) < when, 0.0, after - before)
+
+    def fitted(value: Floats) -> tuple[float, float]:
+        level = float(weight @ value / weight.sum())
+        return level, float(weight @ (value - level) ** 2)
+
+    level, misfit = fitted(value - late)
+    if misfit > fitted(value)[1]:
+        return constant
+    sd = max(float(weight.sum() ** -0.5), other.sd)
+    return Offset(constant.seconds, sd, sd < OBSERVABLE, ((when - 1e-3, level), (when, level + after - before)), "step")
 
 
 def _wheels(
@@ -410,6 +504,7 @@ def _wheels(
     known: Calibration,
     solved: Sequence[reckoning.Piece],
     given: Offset,
+    cut: float | None,
 ) -> tuple[Calibration, reckoning.Streams, list[reckoning.Piece]] | None:
     """Take the speed for that of wheels ahead of the rear axle; return what that gives if the log shows them."""
     if not {"speed", "yaw_rate"} <= set(known.offsets):
@@ -436,7 +531,7 @@ def _wheels(
         for part, piece in zip(parts, solved, strict=True)
     ]
     sound = [piece for piece in again if piece.sound]
-    return (_joined(known, sound, tuple(known.offsets), given), streams, again) if sound else None
+    return (_joined(known, sound, tuple(known.offsets), given, cut), streams, again) if sound else None
 
 
 def _antenna(
@@ -445,6 +540,7 @@ def _antenna(
     known: Calibration,
     solved: Sequence[reckoning.Piece],
     given: Offset,
+    cut: float | None,
 ) -> Calibration | None:
     """Let the antenna sit off the axle; return what that gives if the log tells where."""
     clocks = [known.offsets[name].seconds if name in known.offsets else 0.0 for name in _SENSORS]
@@ -475,7 +571,7 @@ def _antenna(
     if not off:
         return known
     path = np.concatenate([np.column_stack((piece.t, piece.azimuth)) for piece in found])
-    known = _joined(known, found, tuple(known.offsets), given)
+    known = _joined(known, found, tuple(known.offsets), given, cut)
     return replace(known, antenna=(float(place[0]), float(place[1])), antenna_observable=True, path=_continuous(path))
 
 
