@@ -45,9 +45,8 @@ STANDING, EDGE, SHORTEST = 0.1, 1.0, 1.0
 #: The bias is told every so many seconds.
 KNOT = 30.0
 
-#: Two offsets, one before and one after some time, are looked at closer if they raise the log-likelihood of the rough
-#: look by this much; so much of the drive must lie on either side, and cuts are tried so far apart, s.
-STEP_HOPE, STEP_SIDE, STEP_APART = 4.0, 15.0, 1.0
+#: A step of the clocks has so much of the drive on either side, and is looked for at times so far apart, s.
+STEP_SIDE, STEP_APART = 30.0, 1.0
 
 #: A change of a clock is believed if it makes the misfit of the pieces smaller by this much, and is this large, s.
 CHANGE_GAIN, CHANGE_LEAST = 25.0, 0.05
@@ -266,7 +265,8 @@ class _Rough:
         for when, loglik in found:
             before = loglik[np.searchsorted(when, cuts)]
             gain += before.max(axis=1) + (loglik[-1] - before).max(axis=1) - loglik[-1].max()
-        if gain.max() <= STEP_HOPE:
+        # so many steps were tried that one of them gains this much by chance
+        if gain.max() <= np.log(cuts.size * self.lags.size):
             return None
         # where nothing tells when, as in a gap, the middle is never far off
         alike = np.flatnonzero(gain > gain.max() - 0.5)
@@ -298,6 +298,32 @@ def _capped(rows: Floats) -> Floats:
     if not len(rows):
         return rows
     return np.minimum(rows, 4.0 * max(float(np.median(rows.min(axis=1))), float(np.median(rows)), 1e-6))
+
+
+def agreement(log: Log, known: Calibration, cut: float | None = None) -> dict[str, list[tuple[Floats, Floats]]]:
+    """Return how badly each offset of a stream's clock fits what the fixes show.
+
+    Parameters
+    ----------
+    log : Log
+    known : Calibration
+        Units and scale are put right by it, clocks are not.
+    cut : float, optional
+        Time before and after which it is asked separately, s.
+
+    Returns
+    -------
+    dict of str to list of (offsets, misfits)
+        For ``"speed"`` (m/s) and ``"yaw_rate"`` (rad in five seconds), of those that the log has: one curve for each
+        side of the cut with enough windows.
+    """
+    rough = _Rough.of(log, known)
+    curves = {}
+    for name in rough.misfit:
+        when, rows = rough._capped(name)
+        sides = [np.ones(when.size, dtype=bool)] if cut is None else [when < cut, when >= cut]
+        curves[name] = [(rough.lags, rows[side].mean(axis=0)) for side in sides if side.sum() >= FEWEST]
+    return curves
 
 
 # ---- piece by piece ------------------------------------------------------------------------------------------------

@@ -6,8 +6,10 @@ the same order before the sensors are judged: leaps, frozen fixes and late stamp
 log cannot tell is said to be not checked, never guessed.
 """
 
+import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from halfwidth.vehicle import check_sensors, evidence
 from halfwidth.vehicle.align import calibrated, steps_of
 from halfwidth.vehicle.check_sensors import Item as Item
-from halfwidth.vehicle.distrust import distrusted
+from halfwidth.vehicle.distrust import NOTHING, Distrust, distrusted
 from halfwidth.vehicle.log import STREAMS, Log
 from halfwidth.vehicle.repair import (
     contradicted_convention,
@@ -24,6 +26,7 @@ from halfwidth.vehicle.repair import (
     matched_factor,
     swapped_columns,
 )
+from halfwidth.vehicle.sensors import Calibration
 from halfwidth.vehicle.spikes import spikes
 from halfwidth.vehicle.stamps import Stamps, delays, restamped
 
@@ -59,6 +62,31 @@ _UNIT_AS_TYPED = {"speed is in km/h": "km/h", "speed is in mph": "mph", "speed i
                   "time is in nanoseconds": "ns"}  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """What the points of a check were judged by, for its pictures.
+
+    Parameters
+    ----------
+    log : Log
+        Without spikes, frozen fixes and jumps, at the times at which its sensors spoke.
+    fixes : Log
+        The same with all fixes, as written.
+    known : Calibration
+        Of its sensors.
+    stamps : Stamps
+        From the times as written to those as said.
+    doubted : Distrust
+        Fixes that are frozen or jump, as rows of `fixes`.
+    """
+
+    log: Log
+    fixes: Log
+    known: Calibration
+    stamps: Stamps
+    doubted: Distrust
+
+
 @dataclass(frozen=True)
 class Check:
     """What was found in one log.
@@ -73,6 +101,8 @@ class Check:
     items : tuple of Item
     notes : tuple of str
         What reading it recognised, repaired or dropped.
+    basis : Basis or None
+        What the sensors were judged by; None where positions or times have to be put right first.
     """
 
     source: str
@@ -81,6 +111,7 @@ class Check:
     length_s: float
     items: tuple[Item, ...]
     notes: tuple[str, ...]
+    basis: Basis | None = field(default=None, repr=False, compare=False)
 
     @property
     def verdict(self) -> str:
@@ -125,6 +156,23 @@ class Check:
             "notes": list(self.notes),
         }
 
+    def report(self, path: "str | os.PathLike[str]") -> Path:
+        """Write the points and what they rest on, in pictures, as one HTML page that opens without a network.
+
+        Parameters
+        ----------
+        path : str or path
+            Where to; ``-`` is standard output. The file is replaced in one step.
+
+        Returns
+        -------
+        Path
+            Where it was written.
+        """
+        from halfwidth.vehicle.report_log import write_page
+
+        return write_page(self, path)
+
     def __repr__(self) -> str:
         n = {verdict: sum(item.verdict == verdict for item in self.items) for verdict in ("bad", "warn", "ok")}
         return f"Check({self.source!r}: {self.verdict}, {n['bad']} bad, {n['warn']} warn, {n['ok']} ok)"
@@ -161,12 +209,14 @@ def check(log: Any) -> Check:
         log = from_frame(log, repair=False)
     leaping, log = _spikes(log)
     swapped = _swapped(log)
+    basis = None
     if swapped.verdict == "bad":
         first = "put latitude and longitude right first"
         names = ("outliers", "speed", "azimuth", "yaw rate", "trust", "stamps", *check_sensors.NAMES)
         moving = [Item(name, "not checked", first) for name in names]
     else:
-        trust, believed = _trust(log)
+        trust, doubted = _trust(log)
+        believed = doubted.masked(log)
         moving = [_outliers(believed), _speed(log), _azimuth(log), _yaw(log)]
         row = matched_factor(evidence.speed_ratio(log))
         if row is not None and row[3] != 1:
@@ -174,7 +224,9 @@ def check(log: Any) -> Check:
             moving += [trust, *(Item(name, "not checked", first) for name in ("stamps", *check_sensors.NAMES))]
         else:
             said, stamps = restamped(believed)
-            moving += [trust, _stamps(believed, stamps), *check_sensors.items(said, calibrated(said), stamps)]
+            known = calibrated(said)
+            basis = Basis(said, log, known, stamps, doubted)
+            moving += [trust, _stamps(believed, stamps), *check_sensors.items(said, known, stamps)]
     items = (
         _streams(log),
         _rates(log),
@@ -186,7 +238,7 @@ def check(log: Any) -> Check:
         *_steps(log, steps_of(log)),
     )
     length = float(log.t[-1] - log.t[0]) if len(log) else 0.0
-    return Check(log.source, len(log), int(log.fixed.sum()), length, items, log.notes)
+    return Check(log.source, len(log), int(log.fixed.sum()), length, items, log.notes, basis)
 
 
 def _there(log: Log, name: str) -> bool:
@@ -313,22 +365,22 @@ def _outliers(log: Log) -> Item:
     )
 
 
-def _trust(log: Log) -> tuple[Item, Log]:
-    """Look for fixes that were frozen or jumped; return the log without them.
+def _trust(log: Log) -> tuple[Item, Distrust]:
+    """Look for fixes that were frozen or jumped; return which.
 
     Where speed and yaw rate speak, it is they that show jumps: see `check_sensors`.
     """
     n = int(log.fixed.sum())
     if n < 10:
-        return Item("trust", "not checked", "too few fixes"), log
+        return Item("trust", "not checked", "too few fixes"), NOTHING
     sensed = _there(log, "speed_mps") and _there(log, "yaw_rate_radps")
     found = distrusted(log, jumps=not sensed)
     if not len(found):
-        return Item("trust", "ok", "no fix is frozen" + (" or jumps" * (not sensed)), 0.0), log
+        return Item("trust", "ok", "no fix is frozen" + (" or jumps" * (not sensed)), 0.0), found
     said = "; ".join(words.removesuffix(": not used") for words in found.words(log))
     line = check_sensors.fill_line(log)
     item = Item("trust", "bad" if len(found) > 0.05 * n else "warn", said, float(len(found)), line=line)
-    return item, found.masked(log)
+    return item, found
 
 
 def _stamps(log: Log, stamps: Stamps) -> Item:

@@ -87,7 +87,12 @@ def metres(value: float) -> str:
 
 def zero(track: Track) -> float:
     """Choose where the page's times count from: 0, or the first row if times are absolute."""
-    return float(track.t_s[0]) if abs(float(track.t_s[0])) >= 1e8 else 0.0
+    return zero_of(float(track.t_s[0]))
+
+
+def zero_of(first: float) -> float:
+    """Choose where times count from whose first one this is: 0, or the first if they are absolute."""
+    return first if abs(first) >= 1e8 else 0.0
 
 
 def time(track: Track, t: float) -> str:

@@ -112,15 +112,16 @@ def page(track: Track, *, command: str | None = None) -> str:
     limits = picture.limits_of(track.half_m[inside])
     charts = report_charts.layout(track)
     numbers = _data(track, plane, view, rows, charts)
+    log = report_log.section(track)
     sections = [
         _map_section(track, plane, view, rows, limits),
         report_charts.section(track, charts),
         report_tables.gap_section(track, limits),
-        report_log.section(track),
+        log.html,
         report_tables.benchmark_section(track),
         report_tables.settings_section(track, command),
     ]
-    style = markup.part("page.css") + _placing(track, plane, view, charts)
+    style = markup.part("page.css") + _placing(track, plane, view, charts) + log.rules
     script = markup.part("page.js")
     policy = (
         f"default-src 'none'; script-src {markup.policy_hash(script)}; style-src {markup.policy_hash(style)};"
