@@ -412,7 +412,8 @@ def _joined(
     # a bias drifts: the pieces count by how long they are sure of it, not by how sure
     variance = np.array([piece.bias_sd**2 for piece in pieces])
     weight = 1.0 / (variance + max(float(np.var(bias)) - float(np.median(variance)), 0.0))
-    knots = [k for piece in pieces for k in _knots(piece)]
+    shift = _steady(pieces) - bias
+    knots = [(t, b + by) for piece, by in zip(pieces, shift.tolist(), strict=True) for t, b in _knots(piece)]
     some = float(weight @ bias / weight.sum())
     scale_known = bool(sd[0] < 0.5 * reckoning.PRIOR[0]) and "speed" in there
     yaw_known = "yaw_rate" in there
@@ -427,6 +428,22 @@ def _joined(
         slip=float(np.median([piece.sigma[1] for piece in pieces])),
         noise=dict(zip(reckoning.GROUPS, np.median([piece.sigma for piece in pieces], axis=0).tolist(), strict=True)),
     )
+
+
+def _steady(pieces: Sequence[reckoning.Piece]) -> Floats:
+    """Return the mean bias (n,) of each piece, given the others: what a piece hardly tells its neighbours do.
+
+    From piece to piece the bias walks as in `reckoning`, or by more where the pieces differ by more than they may.
+    """
+    bias = np.array([piece.bias.mean() for piece in pieces])
+    variance = np.array([piece.bias_sd**2 for piece in pieces])
+    if bias.size < 2:
+        return bias
+    apart = np.diff([piece.t.mean() for piece in pieces])
+    excess = np.diff(bias) ** 2 - variance[1:] - variance[:-1]
+    walk = np.maximum(reckoning.BIAS_WALK**2, max(float(excess.sum() / apart.sum()), 0.0)) * apart
+    steps = np.diff(np.eye(bias.size), axis=0)
+    return np.asarray(np.linalg.solve(np.diag(1 / variance) + steps.T @ (steps / walk[:, None]), bias / variance))
 
 
 def _knots(piece: reckoning.Piece) -> list[tuple[float, float]]:

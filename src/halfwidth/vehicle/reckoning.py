@@ -47,7 +47,7 @@ _CEILING = np.array([30.0, 3.0, 3.0, 30.0, 1e3])
 _FREEDOM, _MEMORY = 4.0, 60.0
 
 #: Walks of scale and bias a root second.
-_SCALE_WALK, _BIAS_WALK = 1e-4, 1e-4
+_SCALE_WALK, BIAS_WALK = 1e-4, 1e-4
 
 #: Half the distance of the samples that give the derivatives, and how far a clock moves in one round at most, s.
 _APART, _STEP = 0.1, 0.4
@@ -274,7 +274,7 @@ def _motion(
     Q[:, N, AZIMUTH] = Q[:, AZIMUTH, N] = -S * half * d[:, 2]
     Q[:, AZIMUTH, AZIMUTH] = d[:, 2]
     Q[:, OFFSET_E, OFFSET_E] = Q[:, OFFSET_N, OFFSET_N] = slow
-    Q[:, SCALE, SCALE], Q[:, BIAS, BIAS] = _SCALE_WALK**2 * h, _BIAS_WALK**2 * h
+    Q[:, SCALE, SCALE], Q[:, BIAS, BIAS] = _SCALE_WALK**2 * h, BIAS_WALK**2 * h
     A[0], b[0], Q[0] = np.eye(n), 0.0, 0.0
     return A, b, Q, S, C
 
