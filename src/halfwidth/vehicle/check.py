@@ -8,7 +8,7 @@ log cannot tell is said to be not checked, never guessed.
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,9 @@ _COARSE = {
     "ax_mps2": (0.2, "m/s2", "0.2 m/s2"),
     "ay_mps2": (0.2, "m/s2", "0.2 m/s2"),
 }
+
+#: A way of so many metres, and of so many times as far as all fixes lie apart, is none that a car has gone in them.
+_WAY, _WAYS = 200.0, 20.0
 
 _LABEL = {
     "position": "position",
@@ -400,7 +403,7 @@ def _speed(log: Log) -> Item:
         return Item("speed", "not checked", "there is no speed")
     found = evidence.speed_ratio(log)
     if not found.enough:
-        return Item("speed", "not checked", "the car hardly moves between fixes")
+        return _unmoved(log)
     row = matched_factor(found)
     shown = {"windows": found.n, "spread": found.spread}
     text = f"speed is {found.value:.3f} times the distance between fixes over time"
@@ -415,6 +418,25 @@ def _speed(log: Log) -> Item:
         # a scale that `fill` finds
         return Item("speed", "warn", f"{text}, 1 is expected", found.value, "", check_sensors.fill_line(log), shown)
     return Item("speed", "ok", text, found.value, "", "", shown)
+
+
+def _unmoved(log: Log) -> Item:
+    """Judge the speed of a car whose fixes hardly move: it stands, or they are no positions."""
+    t, speed = log.stream("speed_mps")
+    way = float(np.sum(np.diff(t) * np.abs(speed[:-1])))
+    fixed = log.fixed
+    east, north = evidence.local_metres(log.lat_deg[fixed], log.lon_deg[fixed])
+    wide = float(np.hypot(np.ptp(east), np.ptp(north))) if east.size else 0.0
+    if way < _WAY or way < _WAYS * wide:
+        return Item("speed", "not checked", "the car hardly moves between fixes")
+    text = f"the speed adds up to {way:,.0f} m while all fixes lie within {wide:.3g} m"
+    turned = evidence.speed_ratio(replace(log, lat_deg=np.degrees(log.lat_deg), lon_deg=np.degrees(log.lon_deg)))
+    if turned.enough and abs(np.log(max(turned.value, 1e-9))) < 0.2:
+        lat, lon = (log.columns.get(role, "COLUMN") for role in ("lat", "lon"))
+        line = f"--columns 'lat={lat}[rad],lon={lon}[rad]'"
+        return Item("speed", "bad", f"{text}: positions are in radians", way, "m", line)
+    line = "--columns lat=COLUMN,lon=COLUMN"
+    return Item("speed", "bad", f"{text}: are these the columns of the position?", way, "m", line)
 
 
 def _azimuth(log: Log) -> Item:

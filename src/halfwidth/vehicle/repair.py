@@ -45,6 +45,9 @@ _CLOCK_SET = 86_400.0
 #: A clock that goes back further than this has been set, not jittered (s).
 _JITTER = 5.0
 
+#: Rows are shuffled if so many go back in time, and if so many come at the usual rate once they are sorted.
+_DISORDER, _REGULAR = 0.3, 0.8
+
 _GPS_EPOCH = 315_964_800
 _LEAP_SECONDS = 18  # GPS minus UTC, unchanged since 2017
 
@@ -111,7 +114,7 @@ def to_log(raw: Raw, *, repair: bool = True) -> Log:
     log = _limits(log, notes, 1.0 if repair else _MISTAKE)
     log = _held_fixes(log, notes)
     log = _impossible(log, notes)
-    _enough(log, raw)
+    _enough(log, raw, notes)
     return replace(log, notes=tuple(notes))
 
 
@@ -374,11 +377,21 @@ class _Rows:
             self.notes.append("rows ran backwards in time: turned around")
             return
         restarts = np.flatnonzero(step < -_JITTER) + 1
+        if restarts.size and self._shuffled(back):
+            self._keep(np.argsort(self.t, kind="stable"))
+            self.notes.append("rows stood in no order of time: sorted")
+            return
         if restarts.size:
             self._refuse_restart(restarts)
         order = np.argsort(self.t, kind="stable")
         self._keep(order)
         self.notes.append(f"time went backwards {_n(int(back.sum()), 'time')}: rows sorted")
+
+    def _shuffled(self, back: NDArray[np.bool_]) -> bool:
+        """Whether rows of one drive stand in no order: no two share a time, and once sorted they come regularly."""
+        step = np.diff(np.sort(self.t))
+        usual = float(np.median(step))
+        return bool(back.mean() > _DISORDER and step.min() > 0 and np.mean(np.abs(step / usual - 1) < 0.5) > _REGULAR)
 
     def _refuse_restart(self, restarts: NDArray[Any]) -> None:
         """Refuse two drives on one clock; streams one after the other, or blocks in disorder, are fine."""
@@ -665,11 +678,14 @@ def _impossible(log: Log, notes: list[str]) -> Log:
     return replace(log, **changed)
 
 
-def _enough(log: Log, raw: Raw) -> None:
+def _enough(log: Log, raw: Raw, notes: list[str]) -> None:
     n = int(log.fixed.sum())
     if n >= 2:
         return
     what = "no row has a position" if n == 0 else "only one row has a position"
+    lost = [note for note in notes if note.endswith("dropped") or "joined" in note]
+    if lost:
+        what += f" after reading ({'; '.join(lost)})"
     raise BadLog(
         f"`{raw.source}` has {_n(len(log), 'row')} and {what} (`{raw.uses['lat'].column}`,"
         f" `{raw.uses['lon'].column}`), at least two fixes are expected",
