@@ -155,7 +155,7 @@ FAULTS = {
     "first fixes": (first_fixes, ("cannot have been", "off the path", "far from where")),
     "multipath": (multipath, ("cannot have been", "off the path", "far from where")),
     "sensor clock": (sensor_clock, (" s, then ", " s to ")),
-    "clock step": (clock_step, None),
+    "clock step": (clock_step, "clock leaps"),
     "hang": (hang, "late"),
     "spikes": (spikes, "no car can have had"),
     "stuck": (stuck, None),

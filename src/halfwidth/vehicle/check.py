@@ -389,7 +389,7 @@ def _trust(log: Log) -> tuple[Item, Distrust]:
 def _stamps(log: Log, stamps: Stamps) -> Item:
     """Say whether a logger wrote late."""
     if stamps.moved:
-        late = float((stamps.written - stamps.said).max())
+        late = max([float(stamps.late.max()), *(seconds for _, seconds in stamps.leaps)])
         return Item("stamps", "warn", stamps.words(), late, "s", check_sensors.fill_line(log))
     if not _there(log, "speed_mps"):
         return Item("stamps", "not checked", "there is no speed to tell when the fixes were taken")
