@@ -413,7 +413,8 @@ def _speed(log: Log) -> Item:
             "speed", "bad", f"{text}: {row[1]}", found.value, "", _typed(log, name, _UNIT_AS_TYPED[row[1]]), shown
         )
     if abs(found.value - 1) > 0.1:
-        return Item("speed", "bad", f"{text}, 1 is expected and no known unit explains it", found.value, "", "", shown)
+        text += ", 1 is expected and no known unit explains it: another column?"
+        return Item("speed", "bad", text, found.value, "", "--columns speed=COLUMN", shown)
     if abs(found.value - 1) > 0.04:
         # a scale that `fill` finds
         return Item("speed", "warn", f"{text}, 1 is expected", found.value, "", check_sensors.fill_line(log), shown)
@@ -457,7 +458,8 @@ def _azimuth(log: Log) -> Item:
             line = _typed(log, "azimuth_rad", "deg" if degrees_given else "rad", sign)
         return Item("azimuth", "bad", f"{text}: it is in {convention}", degrees, "deg", line, shown)
     if degrees > 20:
-        return Item("azimuth", "bad", f"{text}, no known convention explains it", degrees, "deg", "", shown)
+        text += ", no known convention explains it: another column?"
+        return Item("azimuth", "bad", text, degrees, "deg", "--columns azimuth=COLUMN", shown)
     if degrees > 6:
         return Item("azimuth", "warn", text, degrees, "deg", "", shown)
     return Item("azimuth", "ok", text, degrees, "deg", "", shown)
@@ -479,7 +481,8 @@ def _yaw(log: Log) -> Item:
         line = _typed(log, "yaw_rate_radps", unit, "-" if factor < 0 else "")
         return Item("yaw rate", "bad", f"{text}: {' and '.join(wrong)}", found.slope, "", line, shown)
     if abs(found.slope - 1) > 0.25:
-        return Item("yaw rate", "warn", f"{text}, 1 is expected", found.slope, "", "", shown)
+        text += ", 1 is expected: another column?"
+        return Item("yaw rate", "warn", text, found.slope, "", "--columns yaw_rate=COLUMN", shown)
     return Item("yaw rate", "ok", text, found.slope, "", "", shown)
 
 

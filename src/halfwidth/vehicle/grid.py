@@ -292,8 +292,9 @@ def bridged(clock: Floats, yaw_rate: Floats) -> tuple[Floats, Floats]:
     step = np.diff(clock)
     long = np.flatnonzero(step > _silent_from(step))
     away = np.arange(_EVERY, 6.0 * lasts, _EVERY)
+    left = np.exp(-away / lasts) * (away < away[-1])
     times = [clock[0] - away[::-1], clock, clock[-1] + away]
-    values = [yaw_rate[0] * np.exp(-away[::-1] / lasts), yaw_rate, yaw_rate[-1] * np.exp(-away / lasts)]
+    values = [yaw_rate[0] * left[::-1], yaw_rate, yaw_rate[-1] * left]
     for k in long.tolist():
         since = np.linspace(0.0, step[k], max(2, min(int(step[k] / _EVERY) + 1, MAX_NODES)))[1:-1]
         times.append(clock[k] + since)

@@ -490,6 +490,11 @@ def matched_factor(found: evidence.Finding) -> tuple[float, str, float, float] |
     return None
 
 
+def _off(found: evidence.Finding) -> float:
+    """Return how far a ratio of speeds is from 1, as a logarithm; a speed of zero is far."""
+    return abs(float(np.log(max(found.value, 1e-9))))
+
+
 def _unstated_units(log: Log, raw: Raw, notes: list[str]) -> Log:
     """Settle units that nobody stated: from the fixes where possible, else from the size."""
     if not _stated(raw, "azimuth") and np.isfinite(log.azimuth_rad).any():
@@ -504,7 +509,8 @@ def _unstated_units(log: Log, raw: Raw, notes: list[str]) -> Log:
         factor = SEMICIRCLE / 1e-7
         other = replace(log, lat_deg=log.lat_deg * factor, lon_deg=log.lon_deg * factor)
         given, tried = evidence.speed_ratio(log), evidence.speed_ratio(other)
-        if tried.enough and abs(np.log(tried.value)) < 0.05 < abs(np.log(given.value)) and tried.spread < given.spread:
+        nearer = _off(tried) < 0.05 < _off(given)
+        if tried.enough and nearer and tried.spread < given.spread:
             log = other
             notes[notes.index(scaled)] = "latitude and longitude read as semicircles, as the speed says"
     if not _stated(raw, "speed") and np.isfinite(log.speed_mps).any():
@@ -586,13 +592,13 @@ def swapped_columns(log: Log) -> bool:
     if not log.fixed.any() or float(np.nanmax(np.abs(log.lon_deg))) > 90:
         return False
     given, other = evidence.speed_ratio(log), evidence.speed_ratio(log, swapped=True)
-    fits = other.enough and abs(np.log(other.value)) < 0.1 and other.spread < 0.08
+    fits = other.enough and _off(other) < 0.1 and other.spread < 0.08
     # swapped degrees stretch one direction only, so ratios scatter with the course
     stretched = given.enough and given.spread > 2 * other.spread + 0.02
     name = "radians clockwise from north"
     course, other_course = evidence.course_errors(log)[name], evidence.course_errors(log, swapped=True)[name]
     if course.enough and other_course.enough:
-        by_speed = fits and (stretched or abs(np.log(given.value)) > 0.2)
+        by_speed = fits and (stretched or _off(given) > 0.2)
         return course.value > 0.4 and other_course.value < 0.15 and (by_speed or not given.enough)
     # a wrong scale of the speed looks alike on a straight road: the stretch alone decides
     return fits and stretched

@@ -38,6 +38,10 @@ SLACK, REGULAR = 2e-3, 0.9
 #: speed must come to the fixes there.
 CHANGED, BY, BETTER = 20, 0.05, 0.9
 
+#: A row is punctual if it is late by less than this share of the usual step; so large a share of the rows must be where
+#: no fixes tell whether the others were late.
+PUNCTUAL, MOSTLY = 0.05, 0.75
+
 #: Where fixes are further apart than this, s, so many distances are enough.
 SLOW, CHANGED_SLOW = 0.5, 8
 
@@ -125,15 +129,15 @@ def restamped(log: Log) -> tuple[Log, Stamps]:
     stamps : Stamps
         The way back.
     """
-    found = leaps(log)
-    if found:
-        passed = log.t - sum(np.where(log.t >= when, seconds, 0.0) for when, seconds in found)
-        steady, stamps = restamped(replace(log, t=passed))
-        return steady, Stamps(log.t, stamps.said, found)
     said = _said(log)
     if said is None or not _fits_better(log, said):
+        said = log.t
+    found = leaps(log if said is log.t else replace(log, t=said))
+    if said is log.t and not found:
         return log, Stamps(log.t, log.t)
-    return replace(log, t=said), Stamps(log.t, said)
+    passed = said - sum(np.where(said >= when, seconds, 0.0) for when, seconds in found)
+    written = tuple((float(log.t[np.searchsorted(said, when)]), seconds) for when, seconds in found)
+    return replace(log, t=passed), Stamps(log.t, passed, written)
 
 
 def leaps(log: Log) -> tuple[tuple[float, float], ...]:
@@ -187,9 +191,11 @@ def leaps(log: Log) -> tuple[tuple[float, float], ...]:
         leap = float(step[k]) - usual
         short = float(np.median(misfit(last - pairs, first + pairs)))
         clear = short > max(LEAP_M, LEAP_MISFITS * size) and abs(short / pace - leap) < NEAR * leap
-        # what no car does between two samples was a pause after all
+        # what no car does between two samples was a pause after all; a logger that hung works off what waits
         steady = abs(float(np.diff(np.interp(log.t[[k, k + 1]], clock, np.abs(speed)))[0])) < 1.0 + 12.0 * usual
-        if clear and steady:
+        rows_after = min(k + 1 + max(3, round(BESIDE / usual)), len(log) - 1) - k - 1
+        takes_its_time = log.t[k + 1 + rows_after] - log.t[k + 1] > 0.95 * rows_after * usual
+        if clear and steady and takes_its_time:
             found.append((float(log.t[k + 1]), leap))
     return tuple(found)
 
@@ -284,7 +290,22 @@ def _fits_better(log: Log, said: Floats) -> bool:
         gains.append(
             _misfit(moved, mean * after, moving, told) / max(_misfit(moved, mean * before, moving, told), 1e-12)
         )
-    return bool(gains) and min(gains) < BETTER and max(gains) < NO_WORSE
+    if not gains:
+        return _like_clockwork(log, said)
+    return min(gains) < BETTER and max(gains) < NO_WORSE
+
+
+def _like_clockwork(log: Log, said: Floats) -> bool:
+    """Whether the rows that were written in time come so regularly that the others can only have been late.
+
+    Asked where no fixes tell, as when the logger hung in a gap between them.
+    """
+    late = log.t - said
+    usual = float(np.median(np.diff(log.t)))
+    punctual = late < PUNCTUAL * usual
+    step = np.diff(log.t)[punctual[1:] & punctual[:-1]]
+    alike = np.abs(step - usual) < PUNCTUAL * usual
+    return bool(late.max() > LEAP_S and punctual.mean() > MOSTLY and alike.size > 0 and alike.mean() > REGULAR)
 
 
 def _misfit(moved: Floats, reckoned: Floats, moving: Mask, told: Mask) -> float:
