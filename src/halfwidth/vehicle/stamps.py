@@ -71,11 +71,14 @@ class Stamps:
         Strictly increasing, s; equal where nothing was moved.
     leaps : tuple of (float, float)
         When the clock leapt, as written, and by how much, s.
+    why : str
+        What told that rows were late; empty where none was.
     """
 
     written: Floats
     said: Floats
     leaps: tuple[tuple[float, float], ...] = ()
+    why: str = ""
 
     @property
     def late(self) -> Floats:
@@ -106,10 +109,10 @@ class Stamps:
         ]
         late = self.late
         worst = int(np.argmax(late))
-        if late[worst] > 1e-6:
+        if self.why:
             said.append(
                 f"the log was written up to {late[worst]:.2f} s late (at {self.written[worst]:.0f} s): samples are"
-                " taken at the regular times of their sensors, as the fixes then fit the speed better"
+                f" taken at the regular times of their sensors, as {self.why}"
             )
         return "; ".join(said)
 
@@ -130,14 +133,15 @@ def restamped(log: Log) -> tuple[Log, Stamps]:
         The way back.
     """
     said = _said(log)
-    if said is None or not _fits_better(log, said):
+    why = "" if said is None else _told(log, said)
+    if said is None or not why:
         said = log.t
     found = leaps(log if said is log.t else replace(log, t=said))
     if said is log.t and not found:
         return log, Stamps(log.t, log.t)
     passed = said - sum(np.where(said >= when, seconds, 0.0) for when, seconds in found)
     written = tuple((float(log.t[np.searchsorted(said, when)]), seconds) for when, seconds in found)
-    return replace(log, t=passed), Stamps(log.t, passed, written)
+    return replace(log, t=passed), Stamps(log.t, passed, written, why)
 
 
 def leaps(log: Log) -> tuple[tuple[float, float], ...]:
@@ -259,8 +263,8 @@ def _said(log: Log) -> Floats | None:
     return held if bool((np.diff(held) > 0).all()) else None
 
 
-def _fits_better(log: Log, said: Floats) -> bool:
-    """Whether distances between fixes are nearer to speed times time once the rows are moved.
+def _told(log: Log, said: Floats) -> str:
+    """Return what tells that rows were late: distances between fixes are nearer to speed times time once they are moved.
 
     Neighbours show a jitter of every stamp; fixes some seconds apart a logger that hangs, where the error of the fixes
     hides it from neighbours. One of them must say so clearly, and none the contrary.
@@ -268,7 +272,7 @@ def _fits_better(log: Log, said: Floats) -> bool:
     rows = np.flatnonzero(log.fixed)
     clock, speed = log.stream("speed_mps")
     if clock.size < FEWEST:
-        return False
+        return ""
     east, north = evidence.local_metres(log.lat_deg[rows], log.lon_deg[rows])
     t, new = log.t[rows], said[rows]
     usual = float(np.median(np.diff(t)))
@@ -291,8 +295,8 @@ def _fits_better(log: Log, said: Floats) -> bool:
             _misfit(moved, mean * after, moving, told) / max(_misfit(moved, mean * before, moving, told), 1e-12)
         )
     if not gains:
-        return _like_clockwork(log, said)
-    return min(gains) < BETTER and max(gains) < NO_WORSE
+        return "all others come like clockwork" if _like_clockwork(log, said) else ""
+    return "the fixes then fit the speed better" if min(gains) < BETTER and max(gains) < NO_WORSE else ""
 
 
 def _like_clockwork(log: Log, said: Floats) -> bool:
