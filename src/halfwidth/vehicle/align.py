@@ -51,8 +51,9 @@ STEP_SIDE, STEP_APART = 30.0, 1.0
 #: A change of a clock is believed if it makes the misfit of the pieces smaller by this much, and is this large, s.
 CHANGE_GAIN, CHANGE_LEAST = 25.0, 0.05
 
-#: The same for a step that the rough look saw.
-SEEN_GAIN = 9.0
+#: The same for a step that the rough look saw; and how much worse one stream may fit with the step of the other than
+#: without: a logger mostly has one clock.
+SEEN_GAIN, SHARED = 9.0, 4.0
 
 #: How long after each other the courses lie that are compared with the yaw rate, s.
 _TURN = 5.0
@@ -520,10 +521,7 @@ def _offset(pieces: Sequence[reckoning.Piece], k: int, constant: Offset, cut: fl
 
 
 def _alike(pieces: Sequence[reckoning.Piece], k: int, constant: Offset, other: Offset) -> Offset:
-    """Return an offset that steps like that of the other stream if the pieces do not prefer one that does not.
-
-    Streams mostly share a logger, and both explanations have one unknown.
-    """
+    """Return an offset that steps like that of the other stream unless the pieces clearly prefer one that does not."""
     (_, before), (when, after) = other.at
     value = np.array([piece.mean[k] for piece in pieces])
     weight = np.array([_marginal(piece)[k] ** -2.0 for piece in pieces])
@@ -534,7 +532,7 @@ def _alike(pieces: Sequence[reckoning.Piece], k: int, constant: Offset, other: O
         return level, float(weight @ (value - level) ** 2)
 
     level, misfit = fitted(value - late)
-    if misfit > fitted(value)[1]:
+    if misfit > fitted(value)[1] + SHARED:
         return constant
     sd = max(float(weight.sum() ** -0.5), other.sd)
     return Offset(constant.seconds, sd, sd < OBSERVABLE, ((when - 1e-3, level), (when, level + after - before)), "step")

@@ -431,7 +431,10 @@ def _unmoved(log: Log) -> Item:
     if way < _WAY or way < _WAYS * wide:
         return Item("speed", "not checked", "the car hardly moves between fixes")
     text = f"the speed adds up to {way:,.0f} m while all fixes lie within {wide:.3g} m"
-    turned = evidence.speed_ratio(replace(log, lat_deg=np.degrees(log.lat_deg), lon_deg=np.degrees(log.lon_deg)))
+    as_degrees = log
+    if np.abs(log.lat_deg[fixed]).max() <= np.pi / 2 and np.abs(log.lon_deg[fixed]).max() <= np.pi:
+        as_degrees = replace(log, lat_deg=np.degrees(log.lat_deg), lon_deg=np.degrees(log.lon_deg))
+    turned = evidence.speed_ratio(as_degrees)
     if turned.enough and abs(np.log(max(turned.value, 1e-9))) < 0.2:
         lat, lon = (log.columns.get(role, "COLUMN") for role in ("lat", "lon"))
         line = f"--columns 'lat={lat}[rad],lon={lon}[rad]'"

@@ -264,7 +264,7 @@ def _said(log: Log) -> Floats | None:
 
 
 def _told(log: Log, said: Floats) -> str:
-    """Return what tells that rows were late: distances between fixes are nearer to speed times time once they are moved.
+    """Return what tells that rows were late: distances between fixes are nearer to speed times time once all is moved.
 
     Neighbours show a jitter of every stamp; fixes some seconds apart a logger that hangs, where the error of the fixes
     hides it from neighbours. One of them must say so clearly, and none the contrary.
