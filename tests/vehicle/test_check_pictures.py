@@ -104,9 +104,12 @@ def test_the_page_is_whole_and_inert(faulty):
 
 def test_what_cannot_be_drawn_is_left_out(tmp_path):
     columns = drive()
+    few = {{"t_s": "t"}.get(name, name): values for name, values in columns.items()}
     swapped = columns | {"lat_deg": columns["lon_deg"], "lon_deg": columns["lat_deg"]}
     for name, found in (
         ("swapped", hw.vehicle.check(save(tmp_path / "swapped.csv", swapped))),
+        ("one", hw.vehicle.check(hw.vehicle.Log(t=[0.0], lat_deg=[50.0], lon_deg=[14.0]))),
+        ("few", hw.vehicle.check(hw.vehicle.Log(**{name: values[:9] for name, values in few.items()}))),
         ("two", hw.vehicle.check(hw.vehicle.Log(t=[0.0, 1.0], lat_deg=[50.0, 50.0], lon_deg=[14.0, 14.0]))),
         ("still", hw.vehicle.check(save(tmp_path / "still.csv", columns | {"speed_mps": np.zeros(1200)}))),
         ("evil", replace(hw.vehicle.check(save(tmp_path / "e.csv", columns)), source="<script>alert(1)</script>")),

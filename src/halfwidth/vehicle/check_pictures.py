@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import evidence
-from halfwidth.vehicle.align import agreement
+from halfwidth.vehicle.align import FEWEST, agreement
 from halfwidth.vehicle.check import Basis, Check
 from halfwidth.vehicle.sensors import Offset
 
@@ -130,6 +130,8 @@ def places(check: Check) -> Places | None:
 def _clocks(check: Check, basis: Basis) -> list[Picture]:
     """Show how well each offset of a clock fits, and the one that was found."""
     offsets = {name: one for name, one in basis.known.offsets.items() if not one.given}
+    if not offsets or int(basis.log.fixed.sum()) < FEWEST:
+        return []
     cut = next((one.at[1][0] for one in offsets.values() if one.change == "step"), None)
     curves = agreement(basis.log, basis.known, cut)
     units = {"speed": ("m/s", 1.0), "yaw_rate": ("degrees in 5 s", float(np.degrees(1.0)))}
