@@ -7,7 +7,7 @@ log cannot tell is said to be not checked, never guessed.
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -234,7 +234,7 @@ def check(log: Any) -> Check:
         _streams(log),
         _rates(log),
         _gaps(log),
-        _pauses(log),
+        _pauses(log, () if basis is None else basis.stamps.leaps),
         leaping,
         swapped,
         *moving,
@@ -298,14 +298,16 @@ def _gaps(log: Log) -> Item:
     )
 
 
-def _pauses(log: Log) -> Item:
-    """Look for times at which the sensors that bridge a gap are silent as well."""
+def _pauses(log: Log, leaps: Sequence[tuple[float, float]]) -> Item:
+    """Look for times at which the sensors that bridge a gap are silent as well; leaps of the clock are none."""
     worst: tuple[float, float, str] | None = None
     for name in ("speed_mps", "yaw_rate_radps"):
         t = log.stream(name)[0]
         if t.size < 2:
             continue
         step = np.diff(t)
+        for when, seconds in leaps:
+            step -= np.where((t[:-1] < when) & (t[1:] >= when), seconds, 0.0)
         k = int(np.argmax(step))
         if step[k] > max(1.5, 5 * float(np.median(step))) and (worst is None or step[k] > worst[0]):
             worst = (float(step[k]), float(t[k]), _LABEL[name])

@@ -187,7 +187,7 @@ def _scale(basis: Basis) -> Picture | None:
         calm = ~(turned > _STRAIGHT)
         start, stop, distance = start[calm], stop[calm], distance[calm]
     percent = 100 * (evidence.integral(t, np.abs(speed), start, stop) / distance - 1)
-    when = 0.5 * (start + stop)
+    when = basis.stamps.back(0.5 * (start + stop))
     keep = np.flatnonzero(np.isfinite(percent))
     if keep.size < 5:
         return None
@@ -216,9 +216,11 @@ def _bias(basis: Basis) -> Picture | None:
     stands = [(0.5 * (a + b), rate[(t >= a) & (t <= b)]) for a, b in known.still.tolist()]
     still = np.array([(middle, float(values.mean())) for middle, values in stands if values.size >= 5]).reshape(-1, 2)
     if still.size:
-        layers.append(Layer("dots", "while the car stands", still[:, 0], still[:, 1], colour=1))
+        when = basis.stamps.back(still[:, 0])
+        layers.append(Layer("dots", "while the car stands", when, still[:, 1], colour=1))
     if known.bias_at and np.isfinite(known.bias_sd):
         at, bias = np.array(known.bias_at).T
+        at = basis.stamps.back(at)
         if at.size == 1:
             at, bias = np.array([basis.log.t[0], basis.log.t[-1]]), np.repeat(bias, 2)
         wide = 2 * known.bias_sd
@@ -245,7 +247,7 @@ def _course_bias(basis: Basis, t: Floats, rate: Floats) -> tuple[Floats, Floats]
     )
     keep = np.flatnonzero(np.isfinite(turned))
     keep = keep[:: max(1, -(-keep.size // _MOST))]
-    return (0.5 * (middle[first] + middle[second]))[keep], (turned / took)[keep]
+    return basis.stamps.back(0.5 * (middle[first] + middle[second]))[keep], (turned / took)[keep]
 
 
 def _late(basis: Basis) -> Picture | None:
