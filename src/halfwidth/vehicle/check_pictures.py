@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import evidence
-from halfwidth.vehicle.align import FEWEST, agreement
 from halfwidth.vehicle.check import Basis, Check
+from halfwidth.vehicle.rough import FEWEST, agreement
 from halfwidth.vehicle.sensors import Offset
 
 Floats = NDArray[np.float64]
