@@ -1,5 +1,8 @@
 """What a log tells of its own sensors: clocks, scale, bias, the antenna, and which fixes are wrong."""
 
+import tempfile
+from pathlib import Path
+
 import halfwidth as hw
 
 
@@ -26,6 +29,8 @@ def main():
     report = hw.vehicle.check(log)
     print(report["clock of speed"].sentence)
     print(report["stray fixes"].sentence)
+    with tempfile.TemporaryDirectory() as folder:  # a page with the pictures behind each number
+        print(f"{report.report(Path(folder) / 'check.html').stat().st_size // 1000} kB of pictures")
 
     track = hw.vehicle.fill(log)  # applies all of it, and says so
     print("\n".join(track.messages))

@@ -112,6 +112,33 @@ def test_a_clock_that_steps_is_found(late):
     assert "steps at about" in item.sentence
 
 
+@pytest.mark.parametrize(("seed", "late", "when"), [(6, 0.5, 90.0), (7, -0.35, 190.0)])
+def test_a_clock_that_steps_is_found_in_a_few_minutes(seed, late, when):
+    _, log = simulate_drive(duration=280.0, seed=seed, outages=[(120.0, 135.0)], fix_noise=0.1, fix_offset=0.1)
+    assert {one.change for one in calibrated(log).offsets.values()} == {""}
+    moved = {
+        name: np.where(log.t > when, np.interp(log.t - late, log.t, getattr(log, name)), getattr(log, name))
+        for name in ("speed_mps", "yaw_rate_radps")
+    }
+    found = calibrated(replace(log, **moved))
+    for name in ("speed", "yaw_rate"):
+        one = found.offsets[name]
+        assert one.change == "step"
+        (_, before), (at, after) = one.at
+        assert before == pytest.approx(0, abs=0.1)
+        assert after == pytest.approx(-late, abs=0.1)
+        assert at == pytest.approx(when, abs=25)
+
+
+def test_a_piece_that_hardly_tells_the_bias_has_that_of_its_neighbours():
+    _, log = simulate_drive(seed=5, yaw_bias=0.003, **CLEAN | {"duration": 600.0})
+    rough = np.random.default_rng(1).normal(0, 3 / 111_229, (2, len(log)))
+    early = log.t < 150
+    lat, lon = log.lat_deg + np.where(early, rough[0], 0), log.lon_deg + np.where(early, rough[1], 0)
+    at, bias = np.array(calibrated(replace(log, lat_deg=lat, lon_deg=lon)).bias_at).T
+    assert bias == pytest.approx(calibrated(log).bias_of(at), abs=0.0015)
+
+
 def test_a_clock_that_drifts_is_found():
     _, log = simulate_drive(seed=3, clock_offset=0.1, **CLEAN | {"duration": 1500.0})
     moved = log.stream("speed_mps")[0] * 2.4e-4  # 0.36 s in 25 minutes

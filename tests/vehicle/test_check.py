@@ -34,7 +34,7 @@ def test_a_good_log_is_good(tmp_path):
         ({"speed_mps": lambda v: v * 3.6}, "speed", "speed is in km/h", "--columns 'speed=speed_mps[km/h]'"),
         ({"speed_mps": lambda v: v / 0.44704}, "speed", "speed is in mph", "--columns 'speed=speed_mps[mph]'"),
         ({"speed_mps": lambda v: v / 0.514444}, "speed", "in knots", "--columns 'speed=speed_mps[kn]'"),
-        ({"speed_mps": lambda v: v * 1.5}, "speed", "no known unit explains it", ""),
+        ({"speed_mps": lambda v: v * 1.5}, "speed", "no known unit explains it", "--columns speed=COLUMN"),
         ({"t_s": lambda v: v * 1000}, "speed", "time is in milliseconds", "--columns 'time=t_s[ms]'"),
         ({"yaw_rate_radps": np.degrees}, "yaw rate", "it is in deg/s", "--columns 'yaw_rate=yaw_rate_radps[deg/s]'"),
         ({"yaw_rate_radps": lambda v: -v}, "yaw rate", "its sign", "--columns 'yaw_rate=-yaw_rate_radps[rad/s]'"),
@@ -52,7 +52,7 @@ def test_a_good_log_is_good(tmp_path):
             "--columns 'azimuth=-azimuth_rad[rad]'",
         ),
         ({"azimuth_rad": lambda v: np.pi / 2 - v}, "azimuth", "counter-clockwise from east", "halfwidth fill"),
-        ({"azimuth_rad": lambda v: v + 1.0}, "azimuth", "no known convention explains it", ""),
+        ({"azimuth_rad": lambda v: v + 1.0}, "azimuth", "no known convention explains it", "--columns azimuth=COLUMN"),
     ],
 )
 def test_each_fault_is_named_with_what_to_type(changes, item, words, line, tmp_path):
@@ -61,10 +61,27 @@ def test_each_fault_is_named_with_what_to_type(changes, item, words, line, tmp_p
     assert words in found[item].sentence
     assert found[item].line[: len(line) or None] == line
     assert found.verdict == "bad"
-    if line.startswith("--columns"):
+    if line.startswith("--columns '"):
         # what is to be typed puts it right
         again = hw.vehicle.read(found.source, columns=line.split("'")[1], repair=False)
         assert hw.vehicle.check(again)[item].verdict == "ok"
+
+
+def test_fixes_that_do_not_move_with_the_car_are_no_positions(tmp_path):
+    columns = drive()
+    wrong = columns | {name: np.radians(columns[name]) for name in ("lat_deg", "lon_deg")}
+    item = hw.vehicle.check(save(tmp_path / "log.csv", wrong))["speed"]
+    assert item.verdict == "bad"
+    assert "in radians" in item.sentence
+    read = hw.vehicle.read(tmp_path / "log.csv", columns=item.line.split("'")[1], repair=False)
+    assert hw.vehicle.check(read)["speed"].verdict == "ok"
+    rng = np.random.default_rng(1)
+    parked = columns | {"lat_deg": 50 + 1e-6 * rng.random(1200), "lon_deg": 14 + 1e-6 * rng.random(1200)}
+    item = hw.vehicle.check(save(tmp_path / "parked.csv", parked))["speed"]
+    assert item.verdict == "bad"
+    assert "columns of the position" in item.sentence
+    standing = parked | {"speed_mps": np.zeros(1200)}
+    assert hw.vehicle.check(save(tmp_path / "standing.csv", standing))["speed"].verdict == "not checked"
 
 
 def test_a_logger_that_hangs_is_named_and_the_clocks_are_judged_without_it(tmp_path):

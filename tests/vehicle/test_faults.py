@@ -109,10 +109,36 @@ def test_multipath_that_fades_does_not_bend_a_gap(clean):
     assert in_gaps(truth, fill(log, distrust=False)) > 15
 
 
-def test_a_clock_that_jumps_for_all_streams_is_survived(drive, clean):
+def test_a_jump_does_not_hide_multipath_that_fades(clean):
+    truth, log = simulate_drive(seed=4, multipath=30.0, multipath_time=3.0, **DRIVE)
+    track = fill(shifted(log, after(log, 170, 2.5), 200.0))
+    assert in_gaps(truth, track) < 2 * clean + 1
+
+
+def test_a_clock_of_the_sensors_that_steps_is_named_and_followed(drive, clean):
+    truth, log = drive
+    late = {
+        name: np.where(log.t > 170, np.interp(log.t - 0.6, log.t, getattr(log, name)), getattr(log, name))
+        for name in ("speed_mps", "yaw_rate_radps")
+    }
+    wrong = replace(log, **late)
+    track = fill(wrong)
+    assert said(track, " s, then -0.")
+    assert in_gaps(truth, track) < 2 * clean + 0.5
+    for name in ("clock of speed", "clock of yaw rate"):
+        item = check(wrong)[name]
+        assert item.verdict == "warn"
+        assert "steps at about" in item.sentence
+
+
+def test_a_clock_that_jumps_for_all_streams_is_found(drive, clean):
     truth, log = drive
     moved = replace(log, t=np.where(log.t > 170, log.t + 2.0, log.t))
     track = fill(moved)
+    assert said(track, "the clock leaps by 2.0")
+    found = check(moved)
+    assert found["stamps"].value == pytest.approx(2.0, abs=0.1)
+    assert found["pauses"].verdict == "ok"
     assert in_gaps(truth, track, GAPS[:1]) < 2 * clean + 0.5
     assert in_gaps(truth, track, ((222.0, 237.0),), late=2.0) < 2 * clean + 0.5
 

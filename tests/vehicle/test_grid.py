@@ -40,6 +40,32 @@ def test_the_clock_offset_moves_the_sensors_later():
         sampled(line(t), clock_offset=np.nan)
 
 
+def test_a_silent_yaw_rate_goes_back_to_zero_and_a_silent_speed_lasts():
+    t = np.arange(0, 90.01, 0.1)
+    heard = (t < 30) | (t > 60)
+    log = line(t, speed_mps=np.where(heard, 10.0, np.nan), yaw_rate_radps=np.where(heard, 0.3, np.nan))
+    grid = sampled(log)
+    middle = (grid.t > 40) & (grid.t < 50)
+    assert np.abs(grid.yaw_rate[middle]).max() < 0.02
+    np.testing.assert_allclose(grid.speed[middle], 10.0)
+    assert np.abs(grid.yaw_rate[middle][::-1] - grid.yaw_rate[middle]).max() < 1e-3  # the same from both sides
+    # the same where it is hidden, and beyond the last sample
+    whole = sampled(line(t, speed_mps=np.full(t.size, 10.0), yaw_rate_radps=np.full(t.size, 0.3)))
+    hidden = whole.masked((whole.t > 30) & (whole.t < 60), ("speed", "yaw_rate"))
+    np.testing.assert_allclose(hidden.yaw_rate[middle], grid.yaw_rate[middle], atol=2e-3)
+    np.testing.assert_allclose(hidden.speed, 10.0)
+    open_end = sampled(line(t, speed_mps=np.full(t.size, 10.0), yaw_rate_radps=np.where(t < 30, 0.3, np.nan)))
+    assert np.abs(open_end.yaw_rate[-1]) < 1e-6
+    np.testing.assert_allclose(open_end.yaw_rate[1:100], 0.3)
+
+
+def test_a_short_silence_is_bridged_straight():
+    t = np.arange(0, 20.01, 0.1)
+    rate = np.where(np.abs(t - 10) < 0.4, np.nan, 0.02 * t)
+    grid = sampled(line(t, yaw_rate_radps=rate))
+    np.testing.assert_allclose(grid.yaw_rate[1:], 0.02 * 0.5 * (grid.t[1:] + grid.t[:-1]), atol=3e-3)
+
+
 def test_pauses_get_nodes_and_streams_keep_their_clocks():
     made = known(60.0, rate=10.0)
     grid = sampled(made.log.without(20.05, 40.05))

@@ -8,6 +8,7 @@ import pytest
 from tests.vehicle.drives import drive, save, text
 
 import halfwidth as hw
+from halfwidth.errors import BadLog
 from halfwidth.vehicle import evidence
 from halfwidth.vehicle.formats import layout
 from halfwidth.vehicle.log import STREAMS
@@ -420,6 +421,38 @@ def test_swapped_columns_are_seen_without_an_azimuth(tmp_path):
     del columns["azimuth_rad"]
     log = hw.vehicle.read(save(tmp_path / "log.csv", columns))
     np.testing.assert_allclose(log.lat_deg, columns["lon_deg"], atol=1e-7)
+
+
+def test_shuffled_rows_are_sorted(tmp_path):
+    columns = drive()
+    order = np.random.default_rng(1).permutation(1200)
+    log = hw.vehicle.read(save(tmp_path / "log.csv", {name: values[order] for name, values in columns.items()}))
+    assert log.t == pytest.approx(columns["t_s"])
+    assert log.speed_mps == pytest.approx(columns["speed_mps"])
+    assert any("no order" in note for note in log.notes)
+
+
+def test_a_column_of_numbers_in_no_order_is_no_time(tmp_path):
+    columns = drive()
+    with pytest.raises(BadLog, match="clock"):
+        hw.vehicle.read(save(tmp_path / "log.csv", columns | {"t_s": np.random.default_rng(1).normal(0, 500, 1200)}))
+
+
+def test_one_space_is_one_delimiter_where_cells_are_empty(tmp_path):
+    columns = drive(every=2)
+    log = hw.vehicle.read(save(tmp_path / "log.txt", columns, delimiter=" "))
+    assert log.speed_mps == pytest.approx(columns["speed_mps"])
+    assert log.fixed.sum() == 600
+    text = (tmp_path / "log.txt").read_text().replace("  ", " ")
+    (tmp_path / "lost.txt").write_text(text)
+    with pytest.raises(BadLog, match="which of them are empty is not known"):
+        hw.vehicle.read(tmp_path / "lost.txt")
+
+
+def test_what_reading_took_away_is_said_where_too_little_is_left(tmp_path):
+    columns = drive()
+    with pytest.raises(BadLog, match="1199 rows with the time of the row before"):
+        hw.vehicle.read(save(tmp_path / "log.csv", columns | {"t_s": np.full(1200, 5.0)}))
 
 
 def test_streams_one_after_the_other_are_sorted_together(tmp_path):

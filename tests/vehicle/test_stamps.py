@@ -7,7 +7,7 @@ import pytest
 
 from halfwidth.vehicle import fill, outages
 from halfwidth.vehicle.log import Log
-from halfwidth.vehicle.stamps import delays, restamped
+from halfwidth.vehicle.stamps import delays, leaps, restamped
 
 
 def _drive(seconds=120.0, rate=10.0, seed=0, jitter=0.0):
@@ -41,6 +41,55 @@ def test_a_logger_that_hangs_is_found_and_put_right():
     assert np.array_equal(stamps.back(found.t), written.t)
     between = 0.5 * (found.t[1:] + found.t[:-1])
     assert (np.diff(stamps.back(np.sort(np.concatenate((found.t, between))))) > 0).all()
+
+
+@pytest.mark.parametrize("rate", [1.0, 10.0])
+def test_a_clock_that_leaps_is_found_and_its_stamps_come_back(rate):
+    log, _ = _drive(seconds=200.0, rate=rate)
+    written = replace(log, t=np.where(log.t < 100, log.t, log.t + 2.5))
+    (one,) = leaps(written)
+    assert one == pytest.approx((102.5, 2.5), abs=0.06)
+    found, stamps = restamped(written)
+    assert stamps.moved
+    assert found.t == pytest.approx(log.t, abs=1e-6)
+    assert np.array_equal(stamps.back(found.t), written.t)
+    assert stamps.late.max() == pytest.approx(0, abs=1e-9)
+    assert "leaps by 2.50 s at 102.5 s" in stamps.words()
+    assert "late" not in stamps.words()
+    track = fill(written.without(120.0, 130.0))
+    assert any("leaps" in message for message in track.messages)
+    assert np.isin(track.t_s, written.t).all()
+
+
+def test_a_pause_in_which_the_car_moves_on_is_none():
+    log, t = _drive(seconds=200.0)
+    kept = (t < 100) | (t > 102.5)
+    paused = Log(
+        **{name: getattr(log, name)[kept] for name in ("t", "lat_deg", "lon_deg", "speed_mps", "yaw_rate_radps")}
+    )
+    assert leaps(paused) == ()
+    assert leaps(log) == ()
+    assert leaps(replace(log, speed_mps=np.full(t.size, np.nan))) == ()
+    assert leaps(Log(t=t[:3], lat_deg=log.lat_deg[:3], lon_deg=log.lon_deg[:3])) == ()
+
+
+def test_a_logger_that_hangs_in_a_gap_is_found_by_its_clockwork():
+    log, said = _drive(seconds=200.0)
+    hidden = (said > 38) & (said < 52)  # no fix tells
+    dark = replace(log, lat_deg=np.where(hidden, np.nan, log.lat_deg), lon_deg=np.where(hidden, np.nan, log.lon_deg))
+    found, stamps = restamped(replace(dark, t=said + _hung(said)))
+    assert np.ptp(found.t - said) < 0.1
+    assert stamps.leaps == ()
+    assert restamped(dark)[0] is dark
+
+
+def test_a_leap_and_a_logger_that_hangs_are_found_together():
+    log, said = _drive(seconds=200.0)
+    written = said + _hung(said)
+    found, stamps = restamped(replace(log, t=np.where(said < 140, written, written + 3.0)))
+    assert np.ptp(found.t - said) < 0.05
+    assert "leaps" in stamps.words()
+    assert "late" in stamps.words()
 
 
 def test_arrival_jitter_is_taken_away():

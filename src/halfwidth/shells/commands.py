@@ -244,18 +244,29 @@ def fill(
 # --- check --------------------------------------------------------------------------------------
 
 
-@app.command(epilog="Example: halfwidth check drive.csv")
+@app.command(epilog="Example: halfwidth check drive.csv --report check.html")
 def check(
     log: LogPath,
+    report: Annotated[
+        str | None, typer.Option(metavar="HTML", help="Page to write: the points, and what they rest on in pictures.")
+    ] = None,
     columns: Columns = None,
     json_: Json = False,
+    force: Force = False,
+    quiet: Quiet = False,
     verbose: Verbose = False,  # noqa: ARG001 - read by the error report
 ) -> int:
     """Say what is wrong with a log: columns, units, signs, gaps, outliers."""
     from halfwidth.vehicle import check as examine
     from halfwidth.vehicle import read
 
+    if report == "-":
+        raise _usage("the page and the words of `check` both claim standard output", "--report check.html")
+    _writable(report, log, force)
     found = examine(read(log, columns=columns, repair=False))
+    if report is not None:
+        found.report(report)
+        _words(f"wrote {report}", quiet)
     if json_:
         _print_json({"command": "check", **found.to_dict()})
     else:

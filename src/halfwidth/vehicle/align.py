@@ -4,13 +4,14 @@ The fixes are the reference. Units and signs come first, as they are factors tha
 clock of each stream is looked for roughly, by sliding it along what fixes a second or a few apart show of it, and then
 finely by dead reckoning (`reckoning`), piece by piece of some minutes. The pieces are independent, so their information
 adds up, and their scatter about the common answer says whether it can be believed: standard deviations are widened by
-it where it is larger than they say, a clock that stepped or drifts shows as pieces that disagree in order of time, and
-an offset that stays vague is called not observable and not applied. A wrong clock poisons scale and bias, so all of
-them are unknowns of one problem.
+it where it is larger than they say, a clock that drifts shows as pieces that disagree in order of time, and an offset
+that stays vague is called not observable and not applied. A clock that steps shows already in the rough look, where two
+offsets, one before and one after, fit much better than one: the drive is cut there. A wrong clock poisons scale and
+bias, so all of them are unknowns of one problem.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +22,7 @@ from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import STREAMS, Log
 from halfwidth.vehicle.repair import contradicted_yaw, matched_factor
+from halfwidth.vehicle.rough import WIDEST, Rough
 from halfwidth.vehicle.sensors import AS_LOGGED, STREAM, Calibration, Offset
 
 Floats = NDArray[np.float64]
@@ -31,8 +33,8 @@ PIECE, MOST_PIECES, PAUSE = 150.0, 40, 30.0
 #: Fixes that a piece needs, and metres that the car must have moved in it.
 FEWEST, LEAST_WAY = 20, 30.0
 
-#: Offsets are looked for this far either way, s, and are observable when their standard deviation is below, s.
-WIDEST, OBSERVABLE = 2.5, 0.15
+#: An offset is observable when its standard deviation is below, s.
+OBSERVABLE = 0.15
 
 #: An antenna off the axle is believed when it is this many standard deviations off, known to this many metres, and the
 #: slow error of the fixes moves by less than this many metres in the time of a turn (10 s).
@@ -46,6 +48,10 @@ KNOT = 30.0
 
 #: A change of a clock is believed if it makes the misfit of the pieces smaller by this much, and is this large, s.
 CHANGE_GAIN, CHANGE_LEAST = 25.0, 0.05
+
+#: The same for a step that the rough look saw; and how much worse one stream may fit with the step of the other than
+#: without: a logger mostly has one clock.
+SEEN_GAIN, SHARED = 9.0, 4.0
 
 #: Rounds with the antenna on the axle, then off it.
 _ROUNDS, _MORE = 12, 6
@@ -75,12 +81,13 @@ def calibrated(log: Log, *, clock_offset: float | None = None) -> Calibration:
     if fixes < FEWEST or not there:
         return known
     known = _units(log, known)
-    rough = _Rough.of(log, known)
+    rough = Rough.of(log, known)
     first = {name: given.seconds if given.given else rough.offset(name) for name in there}
     start = {name: Offset(seconds, 0.0, True) for name, seconds in first.items()}
     known = replace(known, still=standstills(log, replace(known, offsets=start)))
     grid = sampled(log)
-    parts = _parts(grid)
+    cut = None if given.given else rough.cut()
+    parts = _parts(grid, cut)
     plain = replace(known, offsets={}, still=AS_LOGGED.still)
     streams: reckoning.Streams = {name: plain.stream(log, name) for name in _SENSORS}
     if "speed" not in there:
@@ -89,12 +96,12 @@ def calibrated(log: Log, *, clock_offset: float | None = None) -> Calibration:
     pieces = [piece for piece in solved if piece.sound]
     if not pieces:
         return known
-    known = _joined(known, pieces, there, given)
-    rolled = _wheels(log, parts, streams, known, solved, given)
+    known = _joined(known, pieces, there, given, cut)
+    rolled = _wheels(log, parts, streams, known, solved, given, cut)
     if rolled is not None:
         known, streams, solved = rolled
         pieces = [piece for piece in solved if piece.sound]
-    off = _antenna(parts, streams, known, solved, given)
+    off = _antenna(parts, streams, known, solved, given, cut)
     if off is not None:
         known = off
     known = _azimuth(log, known, pieces)
@@ -174,77 +181,15 @@ def standstills(log: Log, known: Calibration) -> Floats:
     return np.column_stack((first[long], last[long]))
 
 
-# ---- a rough look --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Rough:
-    """How badly each offset of a stream fits what the fixes show: medians over windows."""
-
-    lags: Floats  # (L,)
-    when: dict[str, Floats]  # middle of each window
-    misfit: dict[str, Floats]  # (windows, L)
-
-    @classmethod
-    def of(cls, log: Log, known: Calibration) -> "_Rough":
-        t_fix = log.t[log.fixed]
-        usual = float(np.median(np.diff(t_fix)))
-        lags = np.arange(-WIDEST, WIDEST + 1e-9, max(0.1, min(usual, 1.0) / 4))
-        when, misfit = {}, {}
-        plain = replace(known, offsets={})
-        span = max(1.0, usual)
-        chord = evidence.windows(log, span)
-        middle, took = 0.5 * (chord.start + chord.stop), chord.stop - chord.start
-        t, v = plain.stream(log, "speed")
-        if t.size > 2 and middle.size:
-            found = np.stack([np.abs(evidence.integral(t + lag, v, chord.start, chord.stop)) / took for lag in lags], 1)
-            when["speed"] = middle
-            pace = chord.distance / took
-            usable = np.isfinite(found).all(axis=1) & (pace > 1.0)
-            scale = (
-                float(np.median(pace[usable] / np.maximum(np.median(found[usable], axis=1), 0.5)))
-                if usable.any()
-                else 1.0
-            )
-            misfit["speed"] = np.abs(scale * found - pace[:, None])
-        t, w = plain.stream(log, "yaw_rate")
-        if t.size > 2 and middle.size > 2:
-            moving = chord.distance > np.maximum(2.0, 1.0 * took)
-            at, course = middle[moving], chord.course[moving]
-            later = np.searchsorted(at, at + 5.0)
-            there = later < at.size
-            there[there] &= at[later[there]] - at[there] < 8.0
-            a, b = at[there], at[later[there]]
-            turned = wrapped(course[later[there]] - course[there])
-            found = np.stack([-evidence.integral(t + lag, w, a, b) for lag in lags], 1)
-            when["yaw_rate"] = 0.5 * (a + b)
-            misfit["yaw_rate"] = np.abs(wrapped(found - turned[:, None]))
-        return cls(lags, when, misfit)
-
-    def offset(self, name: str, start: float = -np.inf, stop: float = np.inf) -> float:
-        """Return the offset that fits best between two times, 0 where none is clearly better than none, s."""
-        if name not in self.misfit:
-            return 0.0
-        inside = (self.when[name] >= start) & (self.when[name] <= stop)
-        rows = self.misfit[name][inside]
-        rows = rows[np.isfinite(rows).all(axis=1)]
-        if len(rows) < FEWEST:
-            return 0.0
-        # what no offset explains is not counted more than what the best one explains badly
-        cap = 4.0 * max(float(np.median(rows.min(axis=1))), float(np.median(rows)), 1e-6)
-        cost = np.minimum(rows, cap).mean(axis=0)
-        k = int(np.argmin(cost))
-        none = float(np.interp(0.0, self.lags, cost))
-        return float(self.lags[k]) if cost[k] < 0.9 * none else 0.0
-
-
 # ---- piece by piece ------------------------------------------------------------------------------------------------
 
 
-def _parts(grid: Grid) -> list[Grid]:
-    """Cut a drive into pieces in which there is something to see, evenly spread if there are many."""
-    ends = np.flatnonzero(np.diff(grid.t[grid.seen]) > PAUSE)
+def _parts(grid: Grid, cut: float | None) -> list[Grid]:
+    """Cut a drive into pieces in which there is something to see, evenly spread if many; none passes `cut`."""
     fixes = grid.t[grid.seen]
+    ends = np.flatnonzero(np.diff(fixes) > PAUSE)
+    if cut is not None and fixes[0] < cut < fixes[-1]:
+        ends = np.union1d(ends, int(np.searchsorted(fixes, cut)) - 1)
     blocks = zip(np.concatenate(([0], ends + 1)), np.concatenate((ends, [fixes.size - 1])), strict=True)
     parts = []
     for a, b in blocks:
@@ -277,7 +222,7 @@ def _speed_of_fixes(grid: Grid) -> tuple[Floats, Floats]:
 
 
 def _solved(
-    part: Grid, streams: reckoning.Streams, known: Calibration, rough: _Rough, first: dict[str, float], *, fixed: bool
+    part: Grid, streams: reckoning.Streams, known: Calibration, rough: Rough, first: dict[str, float], *, fixed: bool
 ) -> reckoning.Piece:
     """Solve one piece from its own rough offsets; from those of the drive if that fits better."""
     common = tuple(first.get(name, 0.0) for name in _SENSORS)
@@ -303,21 +248,27 @@ def _still(part: Grid, known: Calibration) -> NDArray[np.bool_]:
 # ---- all pieces together -------------------------------------------------------------------------------------------
 
 
-def _joined(known: Calibration, pieces: Sequence[reckoning.Piece], there: Sequence[str], given: Offset) -> Calibration:
+def _joined(
+    known: Calibration, pieces: Sequence[reckoning.Piece], there: Sequence[str], given: Offset, cut: float | None
+) -> Calibration:
     """Add up what the pieces say; find out whether a clock changes."""
     mean, sd, spread = _together(pieces)
-    offsets = {}
-    for name in there:
-        k = 1 + _SENSORS.index(name)
-        if given.given:
-            offsets[name] = given
-        else:
-            offsets[name] = _offset(pieces, k, float(mean[k]), float(sd[k] * max(1.0, spread[k])))
+    offsets = dict.fromkeys(there, given)
+    if not given.given:
+        for name in there:
+            k = 1 + _SENSORS.index(name)
+            size = float(sd[k] * max(1.0, spread[k]))
+            offsets[name] = _offset(pieces, k, Offset(float(mean[k]), size, size < OBSERVABLE), cut)
+        stepping = next((one for one in offsets.values() if one.change == "step"), None)
+        for name, one in offsets.items():
+            if stepping is not None and one.change == "":
+                offsets[name] = _alike(pieces, 1 + _SENSORS.index(name), one, stepping)
     bias = np.array([piece.bias.mean() for piece in pieces])
     # a bias drifts: the pieces count by how long they are sure of it, not by how sure
     variance = np.array([piece.bias_sd**2 for piece in pieces])
     weight = 1.0 / (variance + max(float(np.var(bias)) - float(np.median(variance)), 0.0))
-    knots = [k for piece in pieces for k in _knots(piece)]
+    shift = _steady(pieces) - bias
+    knots = [(t, b + by) for piece, by in zip(pieces, shift.tolist(), strict=True) for t, b in _knots(piece)]
     some = float(weight @ bias / weight.sum())
     scale_known = bool(sd[0] < 0.5 * reckoning.PRIOR[0]) and "speed" in there
     yaw_known = "yaw_rate" in there
@@ -332,6 +283,22 @@ def _joined(known: Calibration, pieces: Sequence[reckoning.Piece], there: Sequen
         slip=float(np.median([piece.sigma[1] for piece in pieces])),
         noise=dict(zip(reckoning.GROUPS, np.median([piece.sigma for piece in pieces], axis=0).tolist(), strict=True)),
     )
+
+
+def _steady(pieces: Sequence[reckoning.Piece]) -> Floats:
+    """Return the mean bias (n,) of each piece, given the others: what a piece hardly tells its neighbours do.
+
+    From piece to piece the bias walks as in `reckoning`, or by more where the pieces differ by more than they may.
+    """
+    bias = np.array([piece.bias.mean() for piece in pieces])
+    variance = np.array([piece.bias_sd**2 for piece in pieces])
+    if bias.size < 2:
+        return bias
+    apart = np.diff([piece.t.mean() for piece in pieces])
+    excess = np.diff(bias) ** 2 - variance[1:] - variance[:-1]
+    walk = np.maximum(reckoning.BIAS_WALK**2, max(float(excess.sum() / apart.sum()), 0.0)) * apart
+    steps = np.diff(np.eye(bias.size), axis=0)
+    return np.asarray(np.linalg.solve(np.diag(1 / variance) + steps.T @ (steps / walk[:, None]), bias / variance))
 
 
 def _knots(piece: reckoning.Piece) -> list[tuple[float, float]]:
@@ -366,16 +333,19 @@ def _marginal(piece: reckoning.Piece) -> Floats:
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(piece.information + np.diag(reckoning.PRIOR**-2.0)))))
 
 
-def _offset(pieces: Sequence[reckoning.Piece], k: int, mean: float, sd: float) -> Offset:
-    """Return an offset of one stream: the same for the drive, or stepping or drifting if the pieces say so."""
+def _offset(pieces: Sequence[reckoning.Piece], k: int, constant: Offset, cut: float | None) -> Offset:
+    """Return an offset of one stream: the same for the drive, or stepping or drifting if the pieces say so.
+
+    Few pieces cannot say how much they scatter: they are only asked about a step at `cut`, which the rough look saw.
+    """
     value = np.array([piece.mean[k] for piece in pieces])
     own = np.array([_marginal(piece)[k] for piece in pieces])
     sure = own < 0.5 * reckoning.PRIOR[k]
-    constant = Offset(mean, sd, bool(sd < OBSERVABLE))
-    if sure.sum() < 4:
-        return constant
-    t = np.array([piece.t.mean() for piece in pieces])[sure]
     ends = np.array([(piece.t[0], piece.t[-1]) for piece in pieces])[sure]
+    t = np.array([piece.t.mean() for piece in pieces])[sure]
+    seen = cut is not None and bool((t < cut).any() and (t > cut).any())
+    if t.size < 4 and not seen:
+        return constant
     value, own = value[sure], np.maximum(own[sure], 0.01)
 
     def misfit(columns: Floats) -> tuple[float, Floats]:
@@ -385,22 +355,41 @@ def _offset(pieces: Sequence[reckoning.Piece], k: int, mean: float, sd: float) -
     ones = np.ones(t.size)
     flat, _ = misfit(ones[:, None])
     line, slope = misfit(np.column_stack((ones, t - t.mean())))
-    cuts = range(1, t.size)
-    tried = [misfit(np.column_stack((np.arange(t.size) < c, np.arange(t.size) >= c)).astype(float)) for c in cuts]
-    cut = int(np.argmin([found[0] for found in tried])) + 1
-    step, levels = tried[cut - 1]
-    best = min(line, step)
+    between = (ends[:-1, 1] + ends[1:, 0]) / 2 if not seen else np.array([cut])
+    tried = [misfit(np.column_stack((t < when, t >= when)).astype(float)) for when in between]
+    best_cut = int(np.argmin([found[0] for found in tried]))
+    step, levels = tried[best_cut]
+    best = step if t.size < 4 else min(line, step)
     noise = max(1.0, best / max(t.size - 2, 1))
-    if (flat - best) / noise < CHANGE_GAIN:
+    if (flat - best) / noise < (SEEN_GAIN if seen else CHANGE_GAIN):
         return constant
-    if step < line - noise and abs(levels[1] - levels[0]) > CHANGE_LEAST:
-        between = (ends[cut - 1, 1] + ends[cut, 0]) / 2
-        at = ((between - 1e-3, float(levels[0])), (between, float(levels[1])))
-        return Offset(mean, sd, True, at, "step")
-    if abs(slope[1]) * np.ptp(t) > CHANGE_LEAST:
+    if (t.size < 4 or step < line - noise) and abs(levels[1] - levels[0]) > CHANGE_LEAST:
+        when = float(between[best_cut])
+        sides = [float(np.sum(own[side] ** -2.0) ** -0.5) for side in (t < when, t >= when)]
+        at = ((when - 1e-3, float(levels[0])), (when, float(levels[1])))
+        return Offset(constant.seconds, float(max(sides) * np.sqrt(noise)), True, at, "step")
+    if t.size >= 4 and abs(slope[1]) * np.ptp(t) > CHANGE_LEAST:
         first, last = ((float(x), float(slope[0] + slope[1] * (x - t.mean()))) for x in (ends[0, 0], ends[-1, 1]))
-        return Offset(float(slope[0]), sd, True, (first, last), "drift")
+        return Offset(float(slope[0]), constant.sd, True, (first, last), "drift")
     return constant
+
+
+def _alike(pieces: Sequence[reckoning.Piece], k: int, constant: Offset, other: Offset) -> Offset:
+    """Return an offset that steps like that of the other stream unless the pieces clearly prefer one that does not."""
+    (_, before), (when, after) = other.at
+    value = np.array([piece.mean[k] for piece in pieces])
+    weight = np.array([_marginal(piece)[k] ** -2.0 for piece in pieces])
+    late = np.where(np.array([piece.t.mean() for piece in pieces]) < when, 0.0, after - before)
+
+    def fitted(value: Floats) -> tuple[float, float]:
+        level = float(weight @ value / weight.sum())
+        return level, float(weight @ (value - level) ** 2)
+
+    level, misfit = fitted(value - late)
+    if misfit > fitted(value)[1] + SHARED:
+        return constant
+    sd = max(float(weight.sum() ** -0.5), other.sd)
+    return Offset(constant.seconds, sd, sd < OBSERVABLE, ((when - 1e-3, level), (when, level + after - before)), "step")
 
 
 def _wheels(
@@ -410,6 +399,7 @@ def _wheels(
     known: Calibration,
     solved: Sequence[reckoning.Piece],
     given: Offset,
+    cut: float | None,
 ) -> tuple[Calibration, reckoning.Streams, list[reckoning.Piece]] | None:
     """Take the speed for that of wheels ahead of the rear axle; return what that gives if the log shows them."""
     if not {"speed", "yaw_rate"} <= set(known.offsets):
@@ -436,7 +426,7 @@ def _wheels(
         for part, piece in zip(parts, solved, strict=True)
     ]
     sound = [piece for piece in again if piece.sound]
-    return (_joined(known, sound, tuple(known.offsets), given), streams, again) if sound else None
+    return (_joined(known, sound, tuple(known.offsets), given, cut), streams, again) if sound else None
 
 
 def _antenna(
@@ -445,6 +435,7 @@ def _antenna(
     known: Calibration,
     solved: Sequence[reckoning.Piece],
     given: Offset,
+    cut: float | None,
 ) -> Calibration | None:
     """Let the antenna sit off the axle; return what that gives if the log tells where."""
     clocks = [known.offsets[name].seconds if name in known.offsets else 0.0 for name in _SENSORS]
@@ -475,7 +466,7 @@ def _antenna(
     if not off:
         return known
     path = np.concatenate([np.column_stack((piece.t, piece.azimuth)) for piece in found])
-    known = _joined(known, found, tuple(known.offsets), given)
+    known = _joined(known, found, tuple(known.offsets), given, cut)
     return replace(known, antenna=(float(place[0]), float(place[1])), antenna_observable=True, path=_continuous(path))
 
 

@@ -6,8 +6,10 @@ the same order before the sensors are judged: leaps, frozen fixes and late stamp
 log cannot tell is said to be not checked, never guessed.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from halfwidth.vehicle import check_sensors, evidence
 from halfwidth.vehicle.align import calibrated, steps_of
 from halfwidth.vehicle.check_sensors import Item as Item
-from halfwidth.vehicle.distrust import distrusted
+from halfwidth.vehicle.distrust import NOTHING, Distrust, distrusted
 from halfwidth.vehicle.log import STREAMS, Log
 from halfwidth.vehicle.repair import (
     contradicted_convention,
@@ -24,6 +26,7 @@ from halfwidth.vehicle.repair import (
     matched_factor,
     swapped_columns,
 )
+from halfwidth.vehicle.sensors import Calibration
 from halfwidth.vehicle.spikes import spikes
 from halfwidth.vehicle.stamps import Stamps, delays, restamped
 
@@ -43,6 +46,9 @@ _COARSE = {
     "ay_mps2": (0.2, "m/s2", "0.2 m/s2"),
 }
 
+#: A way of so many metres, and of so many times as far as all fixes lie apart, is none that a car has gone in them.
+_WAY, _WAYS = 200.0, 20.0
+
 _LABEL = {
     "position": "position",
     "alt_m": "height",
@@ -59,6 +65,31 @@ _UNIT_AS_TYPED = {"speed is in km/h": "km/h", "speed is in mph": "mph", "speed i
                   "time is in nanoseconds": "ns"}  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """What the points of a check were judged by, for its pictures.
+
+    Parameters
+    ----------
+    log : Log
+        Without spikes, frozen fixes and jumps, at the times at which its sensors spoke.
+    fixes : Log
+        The same with all fixes, as written.
+    known : Calibration
+        Of its sensors.
+    stamps : Stamps
+        From the times as written to those as said.
+    doubted : Distrust
+        Fixes that are frozen or jump, as rows of `fixes`.
+    """
+
+    log: Log
+    fixes: Log
+    known: Calibration
+    stamps: Stamps
+    doubted: Distrust
+
+
 @dataclass(frozen=True)
 class Check:
     """What was found in one log.
@@ -73,6 +104,8 @@ class Check:
     items : tuple of Item
     notes : tuple of str
         What reading it recognised, repaired or dropped.
+    basis : Basis or None
+        What the sensors were judged by; None where positions or times have to be put right first.
     """
 
     source: str
@@ -81,6 +114,7 @@ class Check:
     length_s: float
     items: tuple[Item, ...]
     notes: tuple[str, ...]
+    basis: Basis | None = field(default=None, repr=False, compare=False)
 
     @property
     def verdict(self) -> str:
@@ -125,6 +159,23 @@ class Check:
             "notes": list(self.notes),
         }
 
+    def report(self, path: "str | os.PathLike[str]") -> Path:
+        """Write the points and what they rest on, in pictures, as one HTML page that opens without a network.
+
+        Parameters
+        ----------
+        path : str or path
+            Where to; ``-`` is standard output. The file is replaced in one step.
+
+        Returns
+        -------
+        Path
+            Where it was written.
+        """
+        from halfwidth.vehicle.report_log import write_page
+
+        return write_page(self, path)
+
     def __repr__(self) -> str:
         n = {verdict: sum(item.verdict == verdict for item in self.items) for verdict in ("bad", "warn", "ok")}
         return f"Check({self.source!r}: {self.verdict}, {n['bad']} bad, {n['warn']} warn, {n['ok']} ok)"
@@ -161,12 +212,14 @@ def check(log: Any) -> Check:
         log = from_frame(log, repair=False)
     leaping, log = _spikes(log)
     swapped = _swapped(log)
+    basis = None
     if swapped.verdict == "bad":
         first = "put latitude and longitude right first"
         names = ("outliers", "speed", "azimuth", "yaw rate", "trust", "stamps", *check_sensors.NAMES)
         moving = [Item(name, "not checked", first) for name in names]
     else:
-        trust, believed = _trust(log)
+        trust, doubted = _trust(log)
+        believed = doubted.masked(log)
         moving = [_outliers(believed), _speed(log), _azimuth(log), _yaw(log)]
         row = matched_factor(evidence.speed_ratio(log))
         if row is not None and row[3] != 1:
@@ -174,19 +227,21 @@ def check(log: Any) -> Check:
             moving += [trust, *(Item(name, "not checked", first) for name in ("stamps", *check_sensors.NAMES))]
         else:
             said, stamps = restamped(believed)
-            moving += [trust, _stamps(believed, stamps), *check_sensors.items(said, calibrated(said), stamps)]
+            known = calibrated(said)
+            basis = Basis(said, log, known, stamps, doubted)
+            moving += [trust, _stamps(believed, stamps), *check_sensors.items(said, known, stamps)]
     items = (
         _streams(log),
         _rates(log),
         _gaps(log),
-        _pauses(log),
+        _pauses(log, () if basis is None else basis.stamps.leaps),
         leaping,
         swapped,
         *moving,
         *_steps(log, steps_of(log)),
     )
     length = float(log.t[-1] - log.t[0]) if len(log) else 0.0
-    return Check(log.source, len(log), int(log.fixed.sum()), length, items, log.notes)
+    return Check(log.source, len(log), int(log.fixed.sum()), length, items, log.notes, basis)
 
 
 def _there(log: Log, name: str) -> bool:
@@ -243,14 +298,16 @@ def _gaps(log: Log) -> Item:
     )
 
 
-def _pauses(log: Log) -> Item:
-    """Look for times at which the sensors that bridge a gap are silent as well."""
+def _pauses(log: Log, leaps: Sequence[tuple[float, float]]) -> Item:
+    """Look for times at which the sensors that bridge a gap are silent as well; leaps of the clock are none."""
     worst: tuple[float, float, str] | None = None
     for name in ("speed_mps", "yaw_rate_radps"):
         t = log.stream(name)[0]
         if t.size < 2:
             continue
         step = np.diff(t)
+        for when, seconds in leaps:
+            step -= np.where((t[:-1] < when) & (t[1:] >= when), seconds, 0.0)
         k = int(np.argmax(step))
         if step[k] > max(1.5, 5 * float(np.median(step))) and (worst is None or step[k] > worst[0]):
             worst = (float(step[k]), float(t[k]), _LABEL[name])
@@ -313,28 +370,28 @@ def _outliers(log: Log) -> Item:
     )
 
 
-def _trust(log: Log) -> tuple[Item, Log]:
-    """Look for fixes that were frozen or jumped; return the log without them.
+def _trust(log: Log) -> tuple[Item, Distrust]:
+    """Look for fixes that were frozen or jumped; return which.
 
     Where speed and yaw rate speak, it is they that show jumps: see `check_sensors`.
     """
     n = int(log.fixed.sum())
     if n < 10:
-        return Item("trust", "not checked", "too few fixes"), log
+        return Item("trust", "not checked", "too few fixes"), NOTHING
     sensed = _there(log, "speed_mps") and _there(log, "yaw_rate_radps")
     found = distrusted(log, jumps=not sensed)
     if not len(found):
-        return Item("trust", "ok", "no fix is frozen" + (" or jumps" * (not sensed)), 0.0), log
+        return Item("trust", "ok", "no fix is frozen" + (" or jumps" * (not sensed)), 0.0), found
     said = "; ".join(words.removesuffix(": not used") for words in found.words(log))
     line = check_sensors.fill_line(log)
     item = Item("trust", "bad" if len(found) > 0.05 * n else "warn", said, float(len(found)), line=line)
-    return item, found.masked(log)
+    return item, found
 
 
 def _stamps(log: Log, stamps: Stamps) -> Item:
     """Say whether a logger wrote late."""
     if stamps.moved:
-        late = float((stamps.written - stamps.said).max())
+        late = max([float(stamps.late.max()), *(seconds for _, seconds in stamps.leaps)])
         return Item("stamps", "warn", stamps.words(), late, "s", check_sensors.fill_line(log))
     if not _there(log, "speed_mps"):
         return Item("stamps", "not checked", "there is no speed to tell when the fixes were taken")
@@ -348,7 +405,7 @@ def _speed(log: Log) -> Item:
         return Item("speed", "not checked", "there is no speed")
     found = evidence.speed_ratio(log)
     if not found.enough:
-        return Item("speed", "not checked", "the car hardly moves between fixes")
+        return _unmoved(log)
     row = matched_factor(found)
     shown = {"windows": found.n, "spread": found.spread}
     text = f"speed is {found.value:.3f} times the distance between fixes over time"
@@ -358,11 +415,34 @@ def _speed(log: Log) -> Item:
             "speed", "bad", f"{text}: {row[1]}", found.value, "", _typed(log, name, _UNIT_AS_TYPED[row[1]]), shown
         )
     if abs(found.value - 1) > 0.1:
-        return Item("speed", "bad", f"{text}, 1 is expected and no known unit explains it", found.value, "", "", shown)
+        text += ", 1 is expected and no known unit explains it: another column?"
+        return Item("speed", "bad", text, found.value, "", "--columns speed=COLUMN", shown)
     if abs(found.value - 1) > 0.04:
         # a scale that `fill` finds
         return Item("speed", "warn", f"{text}, 1 is expected", found.value, "", check_sensors.fill_line(log), shown)
     return Item("speed", "ok", text, found.value, "", "", shown)
+
+
+def _unmoved(log: Log) -> Item:
+    """Judge the speed of a car whose fixes hardly move: it stands, or they are no positions."""
+    t, speed = log.stream("speed_mps")
+    way = float(np.sum(np.diff(t) * np.abs(speed[:-1])))
+    fixed = log.fixed
+    east, north = evidence.local_metres(log.lat_deg[fixed], log.lon_deg[fixed])
+    wide = float(np.hypot(np.ptp(east), np.ptp(north))) if east.size else 0.0
+    if way < _WAY or way < _WAYS * wide:
+        return Item("speed", "not checked", "the car hardly moves between fixes")
+    text = f"the speed adds up to {way:,.0f} m while all fixes lie within {wide:.3g} m"
+    as_degrees = log
+    if np.abs(log.lat_deg[fixed]).max() <= np.pi / 2 and np.abs(log.lon_deg[fixed]).max() <= np.pi:
+        as_degrees = replace(log, lat_deg=np.degrees(log.lat_deg), lon_deg=np.degrees(log.lon_deg))
+    turned = evidence.speed_ratio(as_degrees)
+    if turned.enough and abs(np.log(max(turned.value, 1e-9))) < 0.2:
+        lat, lon = (log.columns.get(role, "COLUMN") for role in ("lat", "lon"))
+        line = f"--columns 'lat={lat}[rad],lon={lon}[rad]'"
+        return Item("speed", "bad", f"{text}: positions are in radians", way, "m", line)
+    line = "--columns lat=COLUMN,lon=COLUMN"
+    return Item("speed", "bad", f"{text}: are these the columns of the position?", way, "m", line)
 
 
 def _azimuth(log: Log) -> Item:
@@ -383,7 +463,8 @@ def _azimuth(log: Log) -> Item:
             line = _typed(log, "azimuth_rad", "deg" if degrees_given else "rad", sign)
         return Item("azimuth", "bad", f"{text}: it is in {convention}", degrees, "deg", line, shown)
     if degrees > 20:
-        return Item("azimuth", "bad", f"{text}, no known convention explains it", degrees, "deg", "", shown)
+        text += ", no known convention explains it: another column?"
+        return Item("azimuth", "bad", text, degrees, "deg", "--columns azimuth=COLUMN", shown)
     if degrees > 6:
         return Item("azimuth", "warn", text, degrees, "deg", "", shown)
     return Item("azimuth", "ok", text, degrees, "deg", "", shown)
@@ -405,7 +486,8 @@ def _yaw(log: Log) -> Item:
         line = _typed(log, "yaw_rate_radps", unit, "-" if factor < 0 else "")
         return Item("yaw rate", "bad", f"{text}: {' and '.join(wrong)}", found.slope, "", line, shown)
     if abs(found.slope - 1) > 0.25:
-        return Item("yaw rate", "warn", f"{text}, 1 is expected", found.slope, "", "", shown)
+        text += ", 1 is expected: another column?"
+        return Item("yaw rate", "warn", text, found.slope, "", "--columns yaw_rate=COLUMN", shown)
     return Item("yaw rate", "ok", text, found.slope, "", "", shown)
 
 

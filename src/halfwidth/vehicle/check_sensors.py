@@ -210,7 +210,8 @@ def _slip(known: Calibration) -> Item:
     warn = known.slip > _SLIP
     text = f"the car moves sideways by {100 * known.slip:.1f} % of its speed over a second"
     text += ": is the yaw rate that of this car?" if warn else ""
-    return Item("side slip", "warn" if warn else "ok", text, known.slip)
+    line = "--columns yaw_rate=COLUMN" if warn else ""
+    return Item("side slip", "warn" if warn else "ok", text, known.slip, "", line)
 
 
 def _fix_error(known: Calibration) -> Item:

@@ -3,8 +3,8 @@
 Every estimator of this package works on the same `Grid`. Its nodes are the fixes, thinned to at least 0.19 s apart
 (5 Hz), and, where fixes are further apart than the sensors allow, nodes in between. Speed and yaw rate are averaged
 over each step (their integral by the trapezoid rule, divided by the step), after they have been put right by what is
-known of the sensors (`Calibration`). Where a sensor was silent its mean is an interpolation; `speed_sd` and
-`yaw_rate_sd` say how wrong that may be.
+known of the sensors (`Calibration`). Where a sensor was silent its mean is an interpolation, of the yaw rate one that
+goes back to 0; `speed_sd` and `yaw_rate_sd` say how wrong that may be.
 """
 
 from bisect import bisect_left
@@ -34,6 +34,9 @@ _APART, _CLOSE = 1.2, 0.06
 
 #: How fast a car changes its mind while a sensor is silent: m/s^2 and rad/s^2, up to m/s and rad/s.
 DRIFT = {"speed": (1.5, 10.0), "yaw_rate": (0.15, 0.3)}
+
+#: A speed lasts and a turn ends: a yaw rate goes back to 0 within so many seconds of silence; samples of that, s.
+_LASTS, _EVERY = {"speed": np.inf, "yaw_rate": 3.0}, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +118,7 @@ class Grid:
             grid = replace(grid, height=np.where(hidden, np.nan, self.height))
         for name in silent:
             if getattr(self, f"has_{name}"):
-                mean, sd = _silenced(self.t, hidden, getattr(self, name), getattr(self, f"{name}_sd"), *DRIFT[name])
+                mean, sd = _silenced(self.t, hidden, getattr(self, name), getattr(self, f"{name}_sd"), name)
                 changed: dict[str, Any] = {name: mean, f"{name}_sd": sd}
                 grid = replace(grid, **changed)
         return grid
@@ -184,7 +187,7 @@ def sampled(
         seen=seen,
         course=_course(*sensors.stream(log, "azimuth"), t, seen),
         speed=means(t, *streams["speed"]),
-        yaw_rate=means(t, *streams["yaw_rate"]),
+        yaw_rate=means(t, *bridged(*streams["yaw_rate"])),
         speed_sd=sd["speed"],
         yaw_rate_sd=sd["yaw_rate"],
         has_speed=streams["speed"][0].size > 0,
@@ -269,6 +272,54 @@ def means(t: Floats, clock: Floats, values: Floats) -> Floats:
     return np.concatenate((mean[:1], mean))
 
 
+def bridged(clock: Floats, yaw_rate: Floats) -> tuple[Floats, Floats]:
+    """Return a yaw rate with samples where it was silent: it goes back to 0 and comes from there.
+
+    A straight line from one turn to the next would turn for the whole silence, a full circle in half a minute.
+
+    Parameters
+    ----------
+    clock, yaw_rate : (n,) arrays
+        Times, s, and samples, rad/s.
+
+    Returns
+    -------
+    clock, yaw_rate : (m,) arrays
+    """
+    if clock.size < 2:
+        return clock, yaw_rate
+    lasts = _LASTS["yaw_rate"]
+    step = np.diff(clock)
+    long = np.flatnonzero(step > _silent_from(step))
+    away = np.arange(_EVERY, 6.0 * lasts, _EVERY)
+    left = np.exp(-away / lasts) * (away < away[-1])
+    times = [clock[0] - away[::-1], clock, clock[-1] + away]
+    values = [yaw_rate[0] * left[::-1], yaw_rate, yaw_rate[-1] * left]
+    for k in long.tolist():
+        since = np.linspace(0.0, step[k], max(2, min(int(step[k] / _EVERY) + 1, MAX_NODES)))[1:-1]
+        times.append(clock[k] + since)
+        values.append(_bridge(since, np.full(since.size, step[k]), yaw_rate[k], yaw_rate[k + 1], lasts))
+    t, rate = np.concatenate(times), np.concatenate(values)
+    order = np.argsort(t, kind="stable")
+    return t[order], rate[order]
+
+
+def _bridge(since: Floats, length: Floats, first: Floats | float, last: Floats | float, lasts: float) -> Floats:
+    """Return what a quantity is expected to be in a silence between two values, which it forgets in `lasts` seconds."""
+    if not np.isfinite(lasts):
+        return np.asarray(first + (last - first) * since / length)
+
+    def share(left: Floats) -> Floats:  # sinh(left / lasts) / sinh(length / lasts), however long
+        return np.asarray(np.exp((left - length) / lasts) * np.expm1(-2 * left / lasts) / np.expm1(-2 * length / lasts))
+
+    return np.asarray(first * share(length - since) + last * share(since))
+
+
+def _silent_from(step: Floats) -> float:
+    """Return how long a step between two samples must be to be a silence, s."""
+    return max(3.0 * float(np.median(step)), 0.5)
+
+
 def silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
     """Return the standard deviation of each step's mean where the sensor was silent for long, 0 elsewhere.
 
@@ -291,7 +342,7 @@ def silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
     if clock.size < 2 or t.size < 2:
         return np.zeros(t.size)
     step = np.diff(clock)
-    limit = max(3.0 * float(np.median(step)), 0.5)
+    limit = _silent_from(step)
     middle = t.copy()
     middle[1:] -= np.diff(t) / 2
     k = np.searchsorted(clock, middle)
@@ -306,8 +357,9 @@ def silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
     return np.where(length > limit, sd, 0.0)
 
 
-def _silenced(t: Floats, hidden: Mask, mean: Floats, sd: Floats, rate: float, most: float) -> tuple[Floats, Floats]:
+def _silenced(t: Floats, hidden: Mask, mean: Floats, sd: Floats, name: str) -> tuple[Floats, Floats]:
     """Return means and deviations of a sensor that says nothing from node to node around each hidden stretch."""
+    rate, most = DRIFT[name]
     edges = np.flatnonzero(np.diff(np.concatenate(([False], hidden, [False]))))
     h = np.concatenate((np.diff(t)[:1], np.diff(t)))
     middle = t - h / 2
@@ -321,7 +373,15 @@ def _silenced(t: Floats, hidden: Mask, mean: Floats, sd: Floats, rate: float, mo
         new[steps] = np.maximum(sd[steps], np.minimum(rate * np.maximum(far, 0.0), most) * share)
     if lost.all():
         return mean, new
-    return np.where(lost, np.interp(middle, middle[~lost], mean[~lost]), mean), new
+    there = np.flatnonzero(~lost)
+    after = np.searchsorted(there, np.arange(t.size))
+    a, b = there[np.maximum(after - 1, 0)], there[np.minimum(after, there.size - 1)]
+    # before the first and after the last sample it is what it was, and goes on from there
+    length = np.where(a < b, middle[b] - middle[a], np.inf)
+    since = np.clip(np.abs(middle - middle[a]), 0.0, length)
+    alone = mean[a] * np.exp(-since / _LASTS[name])
+    inside = _bridge(since, np.where(a < b, length, 1.0), mean[a], mean[b], _LASTS[name])
+    return np.where(lost, np.where(a < b, inside, alone), mean), new
 
 
 def _course(clock: Floats, values: Floats, t: Floats, seen: Mask) -> Floats:

@@ -441,7 +441,8 @@ def outages(
     sensors = calibrated(drive_log, clock_offset=offset)
     drive = sampled(drive_log, sensors=sensors)
     if int(drive.seen.sum()) < 3:
-        raise BadLog(f"the log has {int(drive.seen.sum())} fixes, at least 3 are expected to hide some")
+        n = int(drive.seen.sum())
+        raise BadLog(f"the log has {n} fixes, at least 3 are expected to hide some", hint="halfwidth check LOG")
     skipped = {m.name: f"the log has no {lack}" for m in chosen if (lack := m.lacks(drive))}
     usable_methods = [m for m in chosen if m.name not in skipped]
     places = {length: _starts(drive, length, starts, seed) for length in given}
@@ -501,10 +502,11 @@ def _nothing_to_try(drive: Grid, lengths: Sequence[float]) -> BadLog | BadValue:
             hint="halfwidth check LOG",
         )
     words = ", ".join(f"{length:g}" for length in possible)
+    longest = ",".join(f"{length:g}" for length in possible[-3:])
     return BadValue(
         f"`lengths` is {asked} s but the fixes of the log span {span:.0f} s, and {MARGIN:g} s of fixes on both sides of"
         f" an outage in which the vehicle moves are expected: {words} s can be tried",
-        hint=f"lengths=({', '.join(f'{length:g}' for length in possible[-3:])},)",
+        hint=f"--lengths {longest}, in Python lengths=({longest},)",
     )
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth import _core
-from halfwidth.vehicle.grid import DRIFT, Grid, means, silence
+from halfwidth.vehicle.grid import DRIFT, Grid, bridged, means, silence
 from halfwidth.vehicle.pointing import azimuth_of
 
 Floats = NDArray[np.float64]
@@ -47,7 +47,7 @@ _CEILING = np.array([30.0, 3.0, 3.0, 30.0, 1e3])
 _FREEDOM, _MEMORY = 4.0, 60.0
 
 #: Walks of scale and bias a root second.
-_SCALE_WALK, _BIAS_WALK = 1e-4, 1e-4
+_SCALE_WALK, BIAS_WALK = 1e-4, 1e-4
 
 #: Half the distance of the samples that give the derivatives, and how far a clock moves in one round at most, s.
 _APART, _STEP = 0.1, 0.4
@@ -210,7 +210,7 @@ def _steps(grid: Grid, streams: Streams, clock: Floats, still: NDArray[np.bool_]
     h = grid.h
 
     def mean(name: str, offset: float) -> Floats:
-        t, values = streams[name]
+        t, values = streams[name] if name == "speed" else bridged(*streams[name])
         return means(grid.t, t + offset, values)
 
     def lost(name: str, offset: float) -> Floats:
@@ -274,7 +274,7 @@ def _motion(
     Q[:, N, AZIMUTH] = Q[:, AZIMUTH, N] = -S * half * d[:, 2]
     Q[:, AZIMUTH, AZIMUTH] = d[:, 2]
     Q[:, OFFSET_E, OFFSET_E] = Q[:, OFFSET_N, OFFSET_N] = slow
-    Q[:, SCALE, SCALE], Q[:, BIAS, BIAS] = _SCALE_WALK**2 * h, _BIAS_WALK**2 * h
+    Q[:, SCALE, SCALE], Q[:, BIAS, BIAS] = _SCALE_WALK**2 * h, BIAS_WALK**2 * h
     A[0], b[0], Q[0] = np.eye(n), 0.0, 0.0
     return A, b, Q, S, C
 

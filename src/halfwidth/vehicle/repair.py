@@ -45,6 +45,9 @@ _CLOCK_SET = 86_400.0
 #: A clock that goes back further than this has been set, not jittered (s).
 _JITTER = 5.0
 
+#: Rows are shuffled if so many go back in time, and if so many come at the usual rate once they are sorted.
+_DISORDER, _REGULAR = 0.3, 0.8
+
 _GPS_EPOCH = 315_964_800
 _LEAP_SECONDS = 18  # GPS minus UTC, unchanged since 2017
 
@@ -111,7 +114,7 @@ def to_log(raw: Raw, *, repair: bool = True) -> Log:
     log = _limits(log, notes, 1.0 if repair else _MISTAKE)
     log = _held_fixes(log, notes)
     log = _impossible(log, notes)
-    _enough(log, raw)
+    _enough(log, raw, notes)
     return replace(log, notes=tuple(notes))
 
 
@@ -374,11 +377,21 @@ class _Rows:
             self.notes.append("rows ran backwards in time: turned around")
             return
         restarts = np.flatnonzero(step < -_JITTER) + 1
+        if restarts.size and self._shuffled(back):
+            self._keep(np.argsort(self.t, kind="stable"))
+            self.notes.append("rows stood in no order of time: sorted")
+            return
         if restarts.size:
             self._refuse_restart(restarts)
         order = np.argsort(self.t, kind="stable")
         self._keep(order)
         self.notes.append(f"time went backwards {_n(int(back.sum()), 'time')}: rows sorted")
+
+    def _shuffled(self, back: NDArray[np.bool_]) -> bool:
+        """Whether rows of one drive stand in no order: no two share a time, and once sorted they come regularly."""
+        step = np.diff(np.sort(self.t))
+        usual = float(np.median(step))
+        return bool(back.mean() > _DISORDER and step.min() > 0 and np.mean(np.abs(step / usual - 1) < 0.5) > _REGULAR)
 
     def _refuse_restart(self, restarts: NDArray[Any]) -> None:
         """Refuse two drives on one clock; streams one after the other, or blocks in disorder, are fine."""
@@ -477,6 +490,11 @@ def matched_factor(found: evidence.Finding) -> tuple[float, str, float, float] |
     return None
 
 
+def _off(found: evidence.Finding) -> float:
+    """Return how far a ratio of speeds is from 1, as a logarithm; a speed of zero is far."""
+    return abs(float(np.log(max(found.value, 1e-9))))
+
+
 def _unstated_units(log: Log, raw: Raw, notes: list[str]) -> Log:
     """Settle units that nobody stated: from the fixes where possible, else from the size."""
     if not _stated(raw, "azimuth") and np.isfinite(log.azimuth_rad).any():
@@ -491,7 +509,8 @@ def _unstated_units(log: Log, raw: Raw, notes: list[str]) -> Log:
         factor = SEMICIRCLE / 1e-7
         other = replace(log, lat_deg=log.lat_deg * factor, lon_deg=log.lon_deg * factor)
         given, tried = evidence.speed_ratio(log), evidence.speed_ratio(other)
-        if tried.enough and abs(np.log(tried.value)) < 0.05 < abs(np.log(given.value)) and tried.spread < given.spread:
+        nearer = _off(tried) < 0.05 < _off(given)
+        if tried.enough and nearer and tried.spread < given.spread:
             log = other
             notes[notes.index(scaled)] = "latitude and longitude read as semicircles, as the speed says"
     if not _stated(raw, "speed") and np.isfinite(log.speed_mps).any():
@@ -573,13 +592,13 @@ def swapped_columns(log: Log) -> bool:
     if not log.fixed.any() or float(np.nanmax(np.abs(log.lon_deg))) > 90:
         return False
     given, other = evidence.speed_ratio(log), evidence.speed_ratio(log, swapped=True)
-    fits = other.enough and abs(np.log(other.value)) < 0.1 and other.spread < 0.08
+    fits = other.enough and _off(other) < 0.1 and other.spread < 0.08
     # swapped degrees stretch one direction only, so ratios scatter with the course
     stretched = given.enough and given.spread > 2 * other.spread + 0.02
     name = "radians clockwise from north"
     course, other_course = evidence.course_errors(log)[name], evidence.course_errors(log, swapped=True)[name]
     if course.enough and other_course.enough:
-        by_speed = fits and (stretched or abs(np.log(given.value)) > 0.2)
+        by_speed = fits and (stretched or _off(given) > 0.2)
         return course.value > 0.4 and other_course.value < 0.15 and (by_speed or not given.enough)
     # a wrong scale of the speed looks alike on a straight road: the stretch alone decides
     return fits and stretched
@@ -665,11 +684,14 @@ def _impossible(log: Log, notes: list[str]) -> Log:
     return replace(log, **changed)
 
 
-def _enough(log: Log, raw: Raw) -> None:
+def _enough(log: Log, raw: Raw, notes: list[str]) -> None:
     n = int(log.fixed.sum())
     if n >= 2:
         return
     what = "no row has a position" if n == 0 else "only one row has a position"
+    lost = [note for note in notes if note.endswith("dropped") or "joined" in note]
+    if lost:
+        what += f" after reading ({'; '.join(lost)})"
     raise BadLog(
         f"`{raw.source}` has {_n(len(log), 'row')} and {what} (`{raw.uses['lat'].column}`,"
         f" `{raw.uses['lon'].column}`), at least two fixes are expected",

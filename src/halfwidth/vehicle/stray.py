@@ -14,34 +14,26 @@ never steps and is easily taken for a drift of the slow error: it is looked for 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import chain
+from halfwidth.vehicle.doubts import DOUBTED, Doubt, after_jumps, at_gaps, stretches
 from halfwidth.vehicle.fade import JUDGE, Fade, fades, likely
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
-from halfwidth.vehicle.pointing import azimuth_of
 from halfwidth.vehicle.sensors import Calibration
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: A pause between fixes from this length on may end with wrong ones, s.
-GAP = 3.0
-
-#: Fixes are doubted for so long after a gap or jump, and before a gap, s, where the length that speaks the clearest
-#: counts; and what is around them for so long, s.
-DOUBTED, AROUND = (2.0, 6.0, 12.0, 20.0), 40.0
-
 #: A fix is stray if it is this many standard deviations off where it should be, and this far, m. The fixes agree again
 #: once they are this many off, and must do so for this share of the time in doubt.
 FAR, FAR_M, NEAR, AGREED = 4.0, 0.5, 2.0, 0.15
 
-#: A jump is a step between fixes that differs from what the sensors say by this many usual differences and metres.
-JUMP, JUMP_M = 8.0, 1.0
+#: What is around doubtful fixes for so long is asked where they should have been, s.
+AROUND = 40.0
 
 #: Doubts that are looked into at most, in one drive; how often, as what fades is seen bit by bit; rounds of the chain.
 _MOST, _LOOKS, _ROUNDS = 150, 4, 5
@@ -145,8 +137,10 @@ def strays(grid: Grid, sensors: Calibration) -> Strays:
     )
     noise = np.array([sensors.noise.get(name, _NO_NOISE) for name in chain.GROUPS])
     search = _Search(grid, np.flatnonzero(grid.seen), settings, noise)
-    gaps, jumps = _gaps(grid, search.seen), _jumps(grid, search.seen)
-    doubts = gaps[:_MOST]
+    gaps, jumps = at_gaps(grid, search.seen), after_jumps(grid, search.seen)
+    # what jumps away and back would hide the errors that fade
+    search.look(jumps[:_MOST])
+    doubts = [replace(doubt, first=first) for doubt in gaps[:_MOST] if (first := search.first(doubt)) is not None]
     search.fade(doubts)
     for k in range(_LOOKS):
         doubts = search.look(doubts, 1.0 if k == 0 else _AGAIN)
@@ -157,33 +151,11 @@ def strays(grid: Grid, sensors: Calibration) -> Strays:
     return Strays(at, search.size[at]) if at.size <= 0.3 * search.seen.size else _NONE
 
 
-@dataclass(frozen=True)
-class _Doubt:
-    """Fixes that may be wrong, as numbers among those seen."""
-
-    first: int  # the first one, or the last one if they are doubted backwards
-    most: float  # at most so many seconds of them
-    block: tuple[int, int]  # fixes without a gap among them
-    before: bool  # whether the fixes before them are asked where they should have been
-    after: bool  # and those after them
-    known: bool = False  # whether others beside them are known to be wrong
-
-    @property
-    def backwards(self) -> bool:
-        """Whether the trouble ends a stretch of fixes instead of beginning one."""
-        return self.before and not self.after
-
-    @property
-    def gap(self) -> int:
-        """Return which gap a doubt at one of its ends is about: the number of the first fix after it."""
-        return self.block[1] if self.backwards else self.block[0]
-
-
 @dataclass(frozen=True, eq=False)
 class _Answer:
     """What was said about one doubt at one length."""
 
-    doubt: _Doubt
+    doubt: Doubt
     length: float
     nodes: NDArray[np.intp]  # of the doubtful fixes
     off: list[tuple[Floats, Floats]]  # how far they are off, and the standard deviation of that, for each side asked
@@ -207,7 +179,7 @@ class _Search:
         self.gone = np.zeros(len(grid), dtype=bool)
         self._asked: dict[tuple[bool, bool, float], Floats] = {}
 
-    def look(self, doubts: Sequence[_Doubt], share: float = 1.0) -> list[_Doubt]:
+    def look(self, doubts: Sequence[Doubt], share: float = 1.0) -> list[Doubt]:
         """Find which of the doubtful fixes are wrong; return the doubts that had some, moved on to the next fix.
 
         A share of what is unusual is enough after fixes that were wrong.
@@ -218,15 +190,20 @@ class _Search:
         for doubt in [doubt for doubt in clearest if odds[doubt] >= 0]:
             stray = clearest[doubt]
             self.size[stray.nodes], self.gone[stray.nodes] = stray.distance, True
-            rest = np.flatnonzero(~self.gone[self.seen[doubt.block[0] : doubt.block[1]]]) + doubt.block[0]
-            rest = rest[rest <= doubt.first] if doubt.backwards else rest[rest >= doubt.first]
-            if rest.size:
-                left.append(replace(doubt, first=int(rest[-1 if doubt.backwards else 0]), known=True))
+            first = self.first(doubt)
+            if first is not None:
+                left.append(replace(doubt, first=first, known=True))
         return left
 
-    def _clearest(self, doubts: Sequence[_Doubt], share: float = 1.0) -> dict[_Doubt, "_Wrong"]:
+    def first(self, doubt: Doubt) -> int | None:
+        """Return the first fix of a doubt that is not gone, the last one if it looks backwards; None if all are."""
+        rest = np.flatnonzero(~self.gone[self.seen[doubt.block[0] : doubt.block[1]]]) + doubt.block[0]
+        rest = rest[rest <= doubt.first] if doubt.backwards else rest[rest >= doubt.first]
+        return int(rest[-1 if doubt.backwards else 0]) if rest.size else None
+
+    def _clearest(self, doubts: Sequence[Doubt], share: float = 1.0) -> dict[Doubt, "_Wrong"]:
         """Find which of the doubtful fixes are further off than others are, at the length that says so the clearest."""
-        clearest: dict[_Doubt, _Wrong] = {}
+        clearest: dict[Doubt, _Wrong] = {}
         for answer in self._ask(doubts, DOUBTED):
             doubt, nodes = answer.doubt, answer.nodes
             if not _wrong(answer, share).any():
@@ -240,7 +217,7 @@ class _Search:
                     clearest[doubt] = _Wrong(clear, nodes[wrong], distance[wrong])
         return clearest
 
-    def fade(self, doubts: Sequence[_Doubt]) -> None:
+    def fade(self, doubts: Sequence[Doubt]) -> None:
         """Find errors that fade away from a gap, where one explains the drive better than a jump of the slow error.
 
         A wrong end of a gap makes the other end look wrong, too: the clearer one goes first, and the other is asked
@@ -248,7 +225,7 @@ class _Search:
         """
         for _ in range(2):
             found = self._fading([d for d in doubts if self._beside(d).size >= _FEWEST and not self._silent(d)])
-            clearest: dict[int, _Doubt] = {}
+            clearest: dict[int, Doubt] = {}
             for doubt, wrong in found.items():
                 if doubt.gap not in clearest or wrong.clear > found[clearest[doubt.gap]].clear:
                     clearest[doubt.gap] = doubt
@@ -256,7 +233,7 @@ class _Search:
                 self.size[found[doubt].nodes], self.gone[found[doubt].nodes] = found[doubt].distance, True
             doubts = [doubt for doubt in doubts if clearest.get(doubt.gap, doubt) != doubt]
 
-    def _fading(self, doubts: Sequence[_Doubt]) -> dict[_Doubt, "_Wrong"]:
+    def _fading(self, doubts: Sequence[Doubt]) -> dict[Doubt, "_Wrong"]:
         """Find the doubts in which an error that fades explains some fixes best, and those that it is felt in.
 
         Where reckoning is so many times worse than the chain takes it to be, likelihoods say less by the square of it.
@@ -271,7 +248,7 @@ class _Search:
             since,
         )
         felt = max(float(self.noise[chain.FIX]), _FELT_M)
-        hope: dict[_Doubt, tuple[Fade, _Wrong]] = {}
+        hope: dict[Doubt, tuple[Fade, _Wrong]] = {}
         for doubt, nodes, s, fade in zip(doubts, beside, since, found, strict=True):
             left = fade.left(s)
             odds = fade.gain - fade.worth - _RARE
@@ -288,13 +265,13 @@ class _Search:
                 better[doubt] = wrong
         return better
 
-    def _silent(self, doubt: _Doubt) -> bool:
+    def _silent(self, doubt: Doubt) -> bool:
         """Return whether the gap lacks a sensor for a while: reckoning through it then says nothing about a fade."""
         gap = slice(int(self.seen[doubt.gap - 1]) + 1, int(self.seen[doubt.gap]) + 1)
         silent = (self.grid.speed_sd[gap] > 0) | (self.grid.yaw_rate_sd[gap] > 0)
         return bool(self.grid.h[gap][silent].sum() > _SILENT)
 
-    def _beside(self, doubt: _Doubt) -> NDArray[np.intp]:
+    def _beside(self, doubt: Doubt) -> NDArray[np.intp]:
         """Return the nodes of the fixes in which an error may fade away from a gap."""
         t = self.grid.t[self.seen]
         half = float(t[doubt.block[1] - 1] - t[doubt.block[0]]) / 2
@@ -302,10 +279,10 @@ class _Search:
         nodes = self.seen[lo : doubt.first + 1] if doubt.backwards else self.seen[doubt.first : hi]
         return np.asarray(nodes[~self.gone[nodes]])
 
-    def _ask(self, doubts: Sequence[_Doubt], lengths: Sequence[float]) -> list[_Answer]:
+    def _ask(self, doubts: Sequence[Doubt], lengths: Sequence[float]) -> list[_Answer]:
         """Ask the fixes before, or after, or both, where the doubtful ones should have been."""
         t, seen = self.grid.t[self.seen], self.seen
-        asked: list[tuple[_Doubt, float, NDArray[np.intp], list[slice]]] = []
+        asked: list[tuple[Doubt, float, NDArray[np.intp], list[slice]]] = []
         hidden = []
         for doubt in doubts:
             for length in lengths:
@@ -331,7 +308,7 @@ class _Search:
             for doubt, length, nodes, parts in asked
         ]
 
-    def _odds(self, found: dict[_Doubt, "_Wrong"]) -> dict[_Doubt, float]:
+    def _odds(self, found: dict[Doubt, "_Wrong"]) -> dict[Doubt, float]:
         """Return how much better wrong fixes explain the drive than a jump of the receiver's slow error, as logarithms.
 
         The chain that knows such jumps learns from the drive around the gap as it is, and from the same with the
@@ -358,7 +335,7 @@ class _Search:
             odds[doubt] = gain[len(asked) + i] - gain[i] - against[i] - (0.0 if doubt.known else worth)
         return odds
 
-    def _against(self, doubts: Sequence[_Doubt], wrong: Sequence[NDArray[np.intp]]) -> list[float]:
+    def _against(self, doubts: Sequence[Doubt], wrong: Sequence[NDArray[np.intp]]) -> list[float]:
         """Return by how much the other side of each gap, alone, comes nearer to the doubtful fixes than to those that
         follow, as a logarithm of likelihoods, 0 if it does not.
 
@@ -392,7 +369,7 @@ class _Search:
             found[i] = max(0.0, 0.5 * float(other**2 - own**2) / float(sd) ** 2)
         return found
 
-    def _around(self, doubt: _Doubt, nodes: NDArray[np.intp]) -> slice:
+    def _around(self, doubt: Doubt, nodes: NDArray[np.intp]) -> slice:
         """Return the nodes around a gap with doubtful fixes at one of its ends."""
         t, at = self.grid.t[self.seen], np.searchsorted(self.seen, nodes)
         first, last = (doubt.block[0] - 1, at[-1] + 1) if doubt.after else (at[0] - 1, doubt.block[1])
@@ -400,7 +377,7 @@ class _Search:
         end = int(np.searchsorted(t, t[min(int(last), t.size - 1)] + _SIDE))
         return slice(int(self.seen[begin]), int(self.seen[end - 1]) + 1)
 
-    def _usual(self, doubt: _Doubt, length: float) -> Floats:
+    def _usual(self, doubt: Doubt, length: float) -> Floats:
         """Return how many standard deviations fixes are off at most that nobody doubts, at places all along the drive.
 
         The chain's own deviations are too small on a log whose errors are not as it takes them; these say by how much.
@@ -410,7 +387,7 @@ class _Search:
             room = length + AROUND / 2
             t = self.grid.t[self.seen]
             controls = []
-            blocks = [(a, b) for a, b in _blocks(self.grid, self.seen) if t[b - 1] - t[a] > 2 * room]
+            blocks = [(a, b) for a, b in stretches(self.grid, self.seen) if t[b - 1] - t[a] > 2 * room]
             space = sum(float(t[b - 1] - t[a]) - 2 * room for a, b in blocks)
             # on a short drive they overlap, sooner than being too few
             apart = min(max(length, (t[-1] - t[0]) / _CONTROLS), max(space / (2 * _FEWEST_CONTROLS), 1.0))
@@ -457,46 +434,6 @@ def _off(grid: Grid, nodes: NDArray[np.intp], part: slice, fit: chain.Fit) -> tu
         return np.zeros(nodes.size), np.ones(nodes.size)
     distance = np.hypot(path.east[own] - grid.east[nodes], path.north[own] - grid.north[nodes])
     return distance, np.sqrt(path.variance[own].mean(axis=1) + path.fix_variance)
-
-
-def _gaps(grid: Grid, seen: NDArray[np.intp]) -> list[_Doubt]:
-    """Return the doubts about the first fixes after each gap and the last ones before it."""
-    found = []
-    blocks = _blocks(grid, seen)
-    for k, (a, b) in enumerate(blocks):
-        half = float(grid.t[seen[b - 1]] - grid.t[seen[a]]) / 2
-        if k > 0:
-            found.append(_Doubt(a, half, (a, b), before=False, after=True))
-        if k < len(blocks) - 1:
-            found.append(_Doubt(b - 1, min(half, DOUBTED[1]), (a, b), before=True, after=False))
-    return found
-
-
-def _blocks(grid: Grid, seen: NDArray[np.intp]) -> list[tuple[int, int]]:
-    """Return the stretches of fixes without a gap: the first one and the one after the last, among those seen."""
-    step = np.diff(grid.t[seen])
-    cut = np.flatnonzero(step > max(GAP, 3.0 * float(np.median(step)))) + 1
-    return list(pairwise([0, *cut.tolist(), seen.size]))
-
-
-def _jumps(grid: Grid, seen: NDArray[np.intp]) -> list[_Doubt]:
-    """Return the doubts about what follows a step between fixes that the sensors did not see."""
-    azimuth = azimuth_of(grid)
-    middle = 0.5 * (azimuth + np.concatenate((azimuth[:1], azimuth[:-1])))
-    way = grid.speed * grid.h
-    moved = np.column_stack((np.cumsum(way * np.sin(middle)), np.cumsum(way * np.cos(middle))))[seen]
-    fixes = np.column_stack((grid.east, grid.north))[seen]
-    odd = np.hypot(*(np.diff(fixes, axis=0) - np.diff(moved, axis=0)).T)
-    jumps = np.flatnonzero(odd > max(JUMP * float(np.median(odd)), JUMP_M)) + 1
-    found: list[_Doubt] = []
-    clear = -np.inf
-    for a, b in _blocks(grid, seen):
-        half = float(grid.t[seen[b - 1]] - grid.t[seen[a]]) / 2
-        for j in jumps[(jumps > a) & (jumps < b)].tolist():
-            if grid.t[seen[j]] > clear:
-                found.append(_Doubt(j, half, (a, b), before=True, after=True))
-                clear = grid.t[seen[j]] + 1.0
-    return found
 
 
 def _wrong(answer: _Answer, times: float) -> Mask:

@@ -8,7 +8,7 @@ longer than the limit ends the reading before it is ever in memory.
 import codecs
 import csv
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,9 @@ _COMMENT = ("#", "%", "//")
 
 #: Lines looked at for the header.
 _HEAD_LINES = 60
+
+#: What to type to see a log that can be read.
+_EXAMPLE = "halfwidth demo -o demo writes a log to compare with"
 
 #: More rows of the wrong length than this share of all, and the file is not what it seems.
 _MOST_RAGGED = 0.2
@@ -75,10 +78,15 @@ def read_delimited(source: Source, asked: Mapping[str, str], choose: layout.Choo
     if not any(line.strip() for line in first):
         raise BadLog(
             f"`{source.name}` is empty, a header and at least two fixes are expected"
-            + (f" ({source.damage})" if source.damage else "")
+            + (f" ({source.damage})" if source.damage else ""),
+            hint=_EXAMPLE,
         )
     header = _header(first, asked, source)
     start = header.line + 1
+    if header.delimiter is None and all(
+        len(line.split(" ")) == len(header.names) for line in first[start:] if _holds_data(line)
+    ):
+        header = replace(header, delimiter=" ")  # one space is one delimiter: two of them hold an empty cell
     units: list[str] | None = None
     n_units_line = next((k for k in range(start, min(start + 5, len(first))) if _holds_data(first[k])), None)
     if n_units_line is not None:
@@ -177,12 +185,19 @@ class _Body:
         if self.n_rows == 0:
             raise BadLog(
                 f"`{name}` has a header but no rows, at least two fixes are expected"
-                + (f" ({self.source.damage})" if self.source.damage else "")
+                + (f" ({self.source.damage})" if self.source.damage else ""),
+                hint=_EXAMPLE,
             )
         if self.n_long > _MOST_RAGGED * self.n_rows:
             raise BadLog(
                 f"`{name}` has {self.n_long} of {self.n_rows} rows with more cells than the header's {self.n_names}",
                 hint="decimal commas need another delimiter, such as `;`, or quotes",
+            )
+        if self.header.delimiter is None and self.n_short > _MOST_RAGGED * self.n_rows:
+            raise BadLog(
+                f"`{name}` is separated by white space and {self.n_short} of {self.n_rows} rows have fewer cells than"
+                f" the header's {self.n_names}: which of them are empty is not known",
+                hint="separate cells by `,` or `;`",
             )
         if self.n_short:
             notes.append(f"{_n(self.n_short, 'row')} shorter than the header, the rest left empty")

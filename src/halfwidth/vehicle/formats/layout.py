@@ -393,7 +393,8 @@ def _use_asked(role: str, spec: str, names: Sequence[str], source: str) -> Use:
             column, unit_text = spec.lstrip("- "), None
         else:
             raise BadLog(
-                f"`columns` names {column!r} for {role}, but `{source}` has no such column; found: {_listed(names)}"
+                f"`columns` names {column!r} for {role}, but `{source}` has no such column; found: {_listed(names)}",
+                hint=f"--columns {role}=NAME with one of these",
             )
     unit = None
     if role in KIND:

@@ -248,7 +248,7 @@
 
   // ---- the charts: looking at less time -----------------------------------------------------------
   const W = 2000, H = 400;
-  const charts = [...document.querySelectorAll(".plot")].map((plot) => ({ plot, svg: plot.querySelector("svg"), ...data.charts[plot.dataset.chart] }));
+  const charts = [...document.querySelectorAll(".plot[data-chart]")].map((plot) => ({ plot, svg: plot.querySelector("svg"), ...data.charts[plot.dataset.chart] }));
   const series = { speed, azimuth, east, north };
 
   function path(values, low, high, wraps, a, b) {
@@ -290,7 +290,7 @@
       }
       for (const raw of chart.svg.querySelectorAll(".raw")) raw.classList.toggle("hide", !full);
     }
-    for (const axis of document.querySelectorAll(".axis")) {
+    for (const axis of document.querySelectorAll(".plot[data-chart] .axis")) {
       axis.replaceChildren(...ticks(span[0] - data.zero, span[1] - data.zero).map((value, k) => {
         const label = document.createElement("span");
         label.className = k % 2 ? "tx odd" : "tx";
