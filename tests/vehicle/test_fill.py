@@ -475,7 +475,7 @@ def test_silent_sensors_in_one_gap_do_not_widen_the_others():
 
 
 def test_a_gap_bridged_by_the_other_method_has_no_jumps(monkeypatch):
-    monkeypatch.setattr(sys.modules["halfwidth.vehicle.fill"], "_BETTER", np.inf)
+    monkeypatch.setattr(sys.modules["halfwidth.vehicle.choice"], "_BETTER", np.inf)
     made = drive(duration=300.0)
     track = sound(fill(_hole(made.log, [(100, 120)], "speed_mps", "yaw_rate_radps")))
     assert any("bridged by cv" in message for message in track.messages)
@@ -527,7 +527,7 @@ def _shown(name, sizes, guessed=False):
 
 
 def test_another_way_must_be_better_at_all_lengths_where_the_sensors_speak():
-    nearest = importlib.import_module("halfwidth.vehicle.fill")._nearest
+    nearest = importlib.import_module("halfwidth.vehicle.choice").nearest
     usual = _shown("em", [(5.0, 1.0), (20.0, 4.0), (60.0, 16.0)])
     lucky = _shown("em-white", [(5.0, 1.3), (20.0, 5.0), (60.0, 8.0)])
     better = _shown("em-white", [(5.0, 0.6), (20.0, 2.0), (60.0, 8.0)])
