@@ -38,6 +38,7 @@ from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pieces import CONTEXT, Piece, pieces_of, spans_of, wanted_rows, with_pauses_filled
 from halfwidth.vehicle.roads import roads_of
 from halfwidth.vehicle.running import FEWEST, top_speed
+from halfwidth.vehicle.sensors import Calibration
 from halfwidth.vehicle.spikes import spikes
 from halfwidth.vehicle.stamps import Stamps, restamped
 from halfwidth.vehicle.stray import strays
@@ -112,55 +113,28 @@ def fill(
     known_roads = None if roads is None else roads_of(roads)
     beside = None if second is None else as_log(second)[0]
     drive_log, native = as_log(log)
-    if not drive_log.fixed.any():
-        raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
     messages: list[str] = []
-    if distrust:
-        leaps = spikes(drive_log)
-        messages.extend(leaps.words(drive_log))
-        drive_log = leaps.masked(drive_log)
-        # stray fixes show best against speed and yaw rate, later
-        sensed = all(np.isfinite(getattr(drive_log, name)).any() for name in ("speed_mps", "yaw_rate_radps"))
-        doubtful = distrusted(drive_log, jumps=not sensed)
-        messages.extend(doubtful.words(drive_log))
-        drive_log = doubtful.masked(drive_log)
-    # a second antenna's log is on the clock of the first one as written
-    stamps = Stamps(drive_log.t, drive_log.t)
-    if beside is None:
-        drive_log, stamps = restamped(drive_log)
-    messages.extend(filter(None, [stamps.words()]))
-    drive_log = with_pauses_filled(drive_log, messages)
-    sensors = calibrated(drive_log, clock_offset=None if clock_offset is None else offset)
-    messages.extend(sensors.words())
-    grid = sampled(drive_log, sensors=sensors, second=beside)
+    ready = prepared(drive_log, messages, None if clock_offset is None else offset, distrust=distrust, second=beside)
+    drive_log, grid, pieces, quality, t = ready.log, ready.grid, ready.pieces, ready.quality, ready.t
     if known_roads is not None:
         asked = with_limits(asked, limits, known_roads.local(grid.frame))
     chosen = _chosen(grid, asked, messages)
-    wanted, quality = wanted_rows(drive_log)
-    t = drive_log.t[wanted]
-    believed = grid.seen
-    if distrust:
-        stray = strays(grid, sensors)
-        messages.extend(filter(None, [stray.words(grid)]))
-        grid = stray.masked(grid)
-    pieces = pieces_of(grid, drive_log)
     spans = spans_of(drive_log, grid, chosen, t, quality)
     free = asked is None or asked.name != chosen.name
     answers = estimated(pieces, chosen, spans, level, messages, free=free)
-    columns = _read(answers, pieces, t)
+    columns = read_off(answers, pieces, t)
     away = _distance_in_time(drive_log, t)
     half = _half_widths(columns, answers, grid, away, level, t, quality)
-    arm_east, arm_north = sensors.arm(t)
-    east, north = columns.east + arm_east, columns.north + arm_north
+    east, north = ready.antenna(columns.east, columns.north)
     lat, lon = grid.frame.to_geodetic(east, north)
-    written = stamps.back(t)
+    written = ready.stamps.back(t)
     gaps = gaps_of(written, lat, lon, half.max(axis=1), quality)
-    settings: dict[str, object] = {"context": CONTEXT, "sensors": sensors.to_dict()}
+    settings: dict[str, object] = {"context": CONTEXT, "sensors": ready.sensors.to_dict()}
     settings.update(answers.settings)
     band = None
     if bounds is not None:
-        off = np.isin(t, grid.t[believed & ~grid.seen])  # what is not believed bounds nothing
-        band = _proven(drive_log, wanted, off, grid, np.column_stack((east, north)), bounds, messages)
+        off = np.isin(t, grid.t[ready.seen & ~grid.seen])  # what is not believed bounds nothing
+        band = _proven(drive_log, ready.wanted, off, grid, np.column_stack((east, north)), bounds, messages)
     return Track(
         t_s=written,
         lat_deg=lat,
@@ -174,7 +148,7 @@ def fill(
         since_fix_s=since_fix_of(written, quality),
         level=level,
         method=chosen.name,
-        log=replace(drive_log, t=stamps.back(drive_log.t)),
+        log=replace(drive_log, t=ready.stamps.back(drive_log.t)),
         gaps=gaps,
         # where nothing could be tested, a model's own variance is a size and no probability
         guarantee="credible" if all(bridge.tested for bridge in answers.bridges) else "none",
@@ -185,6 +159,80 @@ def fill(
         proven=band,
         slow_m=None if answers.slow is None else answers.slow.at(t),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A log made ready to be filled: one clock, what is not believed left out, cut into pieces.
+
+    Parameters
+    ----------
+    log : Log
+        On the clock of its fixes.
+    stamps : Stamps
+        Which times of the log as written its times are.
+    sensors : Calibration
+    grid : Grid
+    seen : (T,) array
+        Which nodes of the grid had a fix before strays were left out.
+    pieces : list of Piece
+    wanted : (M,) array
+        Rows of the log that a track has.
+    quality : (M,) array
+        Quality of each.
+    """
+
+    log: Log
+    stamps: Stamps
+    sensors: Calibration
+    grid: Grid
+    seen: NDArray[np.bool_]
+    pieces: list[Piece]
+    wanted: NDArray[np.intp]
+    quality: NDArray[np.str_]
+
+    @property
+    def t(self) -> Floats:
+        """Times of the rows that a track has, (M,), s."""
+        return self.log.t[self.wanted]
+
+    def antenna(self, east: Floats, north: Floats) -> tuple[Floats, Floats]:
+        """Return where the antenna is at these times if what the estimators follow is at `east` and `north`, m."""
+        arm_east, arm_north = self.sensors.arm(self.t)
+        return east + arm_east, north + arm_north
+
+
+def prepared(
+    log: Log, messages: list[str], offset: float | None = None, *, distrust: bool = True, second: Log | None = None
+) -> Prepared:
+    """Make a log ready to be filled, whatever the method; parameters and errors as for `fill`."""
+    if not log.fixed.any():
+        raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
+    if distrust:
+        leaps = spikes(log)
+        messages.extend(leaps.words(log))
+        log = leaps.masked(log)
+        # stray fixes show best against speed and yaw rate, later
+        sensed = all(np.isfinite(getattr(log, name)).any() for name in ("speed_mps", "yaw_rate_radps"))
+        doubtful = distrusted(log, jumps=not sensed)
+        messages.extend(doubtful.words(log))
+        log = doubtful.masked(log)
+    # a second antenna's log is on the clock of the first one as written
+    stamps = Stamps(log.t, log.t)
+    if second is None:
+        log, stamps = restamped(log)
+    messages.extend(filter(None, [stamps.words()]))
+    log = with_pauses_filled(log, messages)
+    sensors = calibrated(log, clock_offset=offset)
+    messages.extend(sensors.words())
+    grid = sampled(log, sensors=sensors, second=second)
+    seen = grid.seen
+    if distrust:
+        stray = strays(grid, sensors)
+        messages.extend(filter(None, [stray.words(grid)]))
+        grid = stray.masked(grid)
+    wanted, quality = wanted_rows(log)
+    return Prepared(log, stamps, sensors, grid, seen, pieces_of(grid, log), wanted, quality)
 
 
 def _proven(
@@ -279,7 +327,7 @@ def _distance_in_time(log: Log, t: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class _Columns:
+class Columns:
     """What the track needs at its rows."""
 
     east: Floats
@@ -290,10 +338,10 @@ class _Columns:
     fix_variance: Floats  # (M,)
 
 
-def _read(answers: Answers, pieces: Sequence[Piece], t: Floats) -> _Columns:
+def read_off(answers: Answers, pieces: Sequence[Piece], t: Floats) -> Columns:
     """Read each row off the path of its piece."""
     east, north, azimuth, speed_at = (np.full(t.size, np.nan) for _ in range(4))
-    columns = _Columns(east, north, azimuth, speed_at, np.zeros((t.size, 2)), np.zeros(t.size))
+    columns = Columns(east, north, azimuth, speed_at, np.zeros((t.size, 2)), np.zeros(t.size))
     starts = np.array([piece.start for piece in pieces])
     of = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(pieces) - 1)
     for i, path in enumerate(answers.paths):
@@ -333,7 +381,7 @@ def _curve(t: Floats, p: Floats, at: Floats) -> Floats:
 
 
 def _half_widths(
-    columns: _Columns,
+    columns: Columns,
     answers: Answers,
     grid: Grid,
     away: Floats,
