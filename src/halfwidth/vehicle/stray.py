@@ -187,6 +187,7 @@ class _Answer:
     length: float
     nodes: NDArray[np.intp]  # of the doubtful fixes
     off: list[tuple[Floats, Floats]]  # how far they are off, and the standard deviation of that, for each side asked
+    apart: Floats  # how far what the sides say is apart, 0 where one was asked
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,10 +327,12 @@ class _Search:
         if not hidden:
             return []
         fits = iter(chain.solve(hidden, self.settings, sigma=self.noise, learn=False))
-        return [
-            _Answer(doubt, length, nodes, [_off(self.grid, nodes, part, next(fits)) for part in parts])
-            for doubt, length, nodes, parts in asked
-        ]
+        answers = []
+        for doubt, length, nodes, parts in asked:
+            said = [next(fits) for _ in parts]
+            off = [_off(self.grid, nodes, part, fit) for part, fit in zip(parts, said, strict=True)]
+            answers.append(_Answer(doubt, length, nodes, off, _apart(nodes, parts, said)))
+        return answers
 
     def _odds(self, found: dict[_Doubt, "_Wrong"]) -> dict[_Doubt, float]:
         """Return how much better wrong fixes explain the drive than a jump of the receiver's slow error, as logarithms.
@@ -459,6 +462,15 @@ def _off(grid: Grid, nodes: NDArray[np.intp], part: slice, fit: chain.Fit) -> tu
     return distance, np.sqrt(path.variance[own].mean(axis=1) + path.fix_variance)
 
 
+def _apart(nodes: NDArray[np.intp], parts: Sequence[slice], fits: Sequence[chain.Fit]) -> Floats:
+    """Return how far the first and the last of some paths are apart at some nodes, m."""
+    first, last = (
+        np.column_stack((fit.path.east, fit.path.north))[nodes - part.start]
+        for fit, part in ((fits[0], parts[0]), (fits[-1], parts[-1]))
+    )
+    return np.nan_to_num(np.hypot(*(last - first).T), nan=np.inf)
+
+
 def _gaps(grid: Grid, seen: NDArray[np.intp]) -> list[_Doubt]:
     """Return the doubts about the first fixes after each gap and the last ones before it."""
     found = []
@@ -503,8 +515,12 @@ def _wrong(answer: _Answer, times: float) -> Mask:
     """Return which of the doubted fixes are wrong: from the first on, up to where they agree again.
 
     They are wrong if all that were asked say so, by so many times the usual; the last one asked says where they agree.
+    Where the sides contradict each other more than the fixes, it is the reckoning that is wrong.
     """
-    far = np.all([(distance > times * FAR * sd) & (distance > FAR_M) for distance, sd in answer.off], axis=0)
+    far = np.all(
+        [(distance > times * FAR * sd) & (distance > np.maximum(FAR_M, answer.apart)) for distance, sd in answer.off],
+        axis=0,
+    )
     distance, sd = answer.off[-1]
     near = distance < np.maximum(times * NEAR * sd, FAR_M)
     if answer.doubt.backwards:
