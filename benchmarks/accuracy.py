@@ -1,7 +1,7 @@
 """Print how far off each method fills outages of real logs, and how `fill` does beside them.
 
     python benchmarks/accuracy.py [FOLDER OF LOGS] [--starts 20] [--seed 1] [--methods linear,em] [--lengths 1,5,30]
-                                  [--tracks 20] [--fair]
+                                  [--tracks 20] [--fair] [--silent speed_mps]
 
 Nothing is told of a log: clocks, scale and bias of its sensors are found from it. The first table of each log is that
 of `halfwidth outages`; the second one, where numbers are asked of the log, sets the chain beside them, in metres and as
@@ -107,11 +107,11 @@ def by_method(ready, name):
     return ready.grid.frame.to_geodetic(*ready.antenna(columns.east, columns.north))
 
 
-def beside(log, begins, length, methods, times):
+def beside(log, begins, length, methods, times, silent):
     """Hide stretches, several far apart at a time, and fill the very same logs by `fill` and by each method."""
     found = Beside()
     for group in hidden.groups(begins, length):
-        left = hidden.without(log, group, length)
+        left = hidden.without(log, group, length, silent)
         clock = time.process_time()
         track = hw.vehicle.fill(left)
         found.seconds.append(time.process_time() - clock)
@@ -148,7 +148,7 @@ def others_best(errors, weight):
     return np.array([table[np.argmin(sums - table[:, k] * weight[k]), k] for k in range(len(weight))])
 
 
-def compared(log, found, lengths, most, methods):
+def compared(log, found, lengths, most, methods, silent):
     """Print the track of `fill` beside the single methods on the very same logs, with the same fixes hidden."""
     nodes = sampled(log, sensors=calibrated(log))
     times = nodes.t[nodes.seen]  # the fixes that `outages` compares with
@@ -161,7 +161,7 @@ def compared(log, found, lengths, most, methods):
         begins = next((cell.start for cell in found.cells if cell.length == length), np.empty(0))[:most]
         if not len(begins):
             continue
-        one = beside(log, begins, length, methods, times)
+        one = beside(log, begins, length, methods, times, silent)
         if not one.start:
             continue
         n, alike = np.array(one.count, dtype=float), np.ones(len(one.start))
@@ -203,6 +203,7 @@ def main():
     parser.add_argument("--lengths", default=",".join(f"{length:g}" for length in LENGTHS))
     parser.add_argument("--tracks", type=int, default=20, help="stretches of each length hidden from fill")
     parser.add_argument("--fair", action="store_true", help="only the last table")
+    parser.add_argument("--silent", help="streams hidden there as well: speed_mps,yaw_rate_radps")
     asked = parser.parse_args()
     lengths = tuple(float(length) for length in asked.lengths.split(","))
     methods = None if asked.methods is None else asked.methods.split(",")
@@ -218,7 +219,9 @@ def main():
             print(found, end="\n\n", flush=True)
             asked_of(path.name, found)
         if asked.tracks:
-            compared(log, found, lengths, asked.tracks, methods or BESIDE)
+            compared(
+                log, found, lengths, asked.tracks, methods or BESIDE, asked.silent.split(",") if asked.silent else ()
+            )
 
 
 if __name__ == "__main__":

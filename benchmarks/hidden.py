@@ -1,5 +1,7 @@
 """Hide fixes of a log, and compare a track with them: what the benchmarks of `fill` share."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from halfwidth.vehicle.frames import Frame
@@ -8,10 +10,12 @@ from halfwidth.vehicle.frames import Frame
 APART = 40.0
 
 
-def without(log, begins, length):
-    """Return a log without the fixes of some stretches of one length."""
+def without(log, begins, length, silent=()):
+    """Return a log without the fixes of some stretches of one length, nor what the named streams say there."""
     for begin in begins:
         log = log.without(begin, begin + length)
+        inside = (log.t >= begin) & (log.t <= begin + length)
+        log = replace(log, **{name: np.where(inside, np.nan, getattr(log, name)) for name in silent})
     return log
 
 

@@ -19,9 +19,13 @@ from halfwidth.vehicle.slow import Slow
 
 Floats = NDArray[np.float64]
 
-#: Constant velocity bridges a gap that lacks sensors if its error times its half-width is below this share of the
-#: chain's: the nearer path with the narrower interval that holds, as a single one of them may be luck.
+#: Another way than the chain fills gaps if its error times its half-width is below this share of the chain's: the
+#: nearer path with the narrower interval that holds, as a single one of them may be luck.
 _BETTER = 0.8
+
+#: Shares of two paths that are tried where what the vehicle did is guessed, and for how many hidden stretches it counts
+#: that both are worth the same.
+_SHARES, _EVEN = np.linspace(0.0, 1.0, 21), 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +36,7 @@ class Bridge:
     by: str
     tested: Sequence[calibrate.Tested]
     least: float
+    share: float = 1.0  # of the other way, where it is not the usual one
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +82,8 @@ def estimated(
     paths = [spare(grid, chosen) if i in failed else found[i] for i, grid in enumerate(grids)]
     good = [i for i in range(len(grids)) if i not in failed]
     sensed = all(grid.has_speed and grid.has_yaw_rate for grid in grids)
-    # where sensors are lacking the chain guesses what they would have said, and constant velocity may do better;
-    # where they speak, fixes may be wrong by white noise and nothing else
+    # where sensors are lacking the chain guesses what they would have said, constant velocity guesses otherwise, and
+    # the mean of both is nearer than either; where they speak, fixes may be wrong by white noise and nothing else
     rivals: dict[str, _Rival] = {}
     if free and chosen.name == "em" and good:
         blind = any(span.silent or not sensed for span in spans)
@@ -96,18 +101,27 @@ def estimated(
         guessed = bool(silent) or not sensed
         against = {name: one for name, one in rivals.items() if (name == "cv") == guessed}
 
+        shares: dict[float, float] = {}
+
         def filled(
             which: Sequence[int],
             hidden: Sequence[Grid],
             guessed: bool = guessed,
             against: Mapping[str, _Rival] = against,
+            shares: dict[float, float] = shares,
         ) -> dict[str, list[Path]]:
             own = [good[k] for k in which]
             first = rerun(own, hidden, guessed)
             ways = {chosen.name: first}
             for name, rival in against.items():
-                both = zip(first, rival.rerun(own, hidden, guessed), hidden, strict=True)
-                ways[name] = [_bridged(a, b, grid, _pauses(grid)) for a, b, grid in both]
+                both = list(zip(first, rival.rerun(own, hidden, guessed), hidden, strict=True))
+                ways[name] = [_bridged(a, b, grid, _even(_pauses(grid), 1.0)) for a, b, grid in both]
+                if guessed:
+                    length, share = _share(first, ways[name], [grids[i] for i in own], hidden)
+                    shares[length] = share
+                    ways[_mixed(chosen.name, name)] = [
+                        _bridged(a, b, grid, _even(_pauses(grid), share)) for a, b, grid in both
+                    ]
             return ways
 
         tests: dict[str, list[calibrate.Tested]] = {}
@@ -123,17 +137,21 @@ def estimated(
         ends = _end_tests(chosen.name, [grids[i] for i in good], good, rerun, outer, level)
         mine = []
         for span in inner:
-            by = nearest(tests, chosen.name, span.length)
-            mine.append(Bridge(span, by, tuple(tests.get(by, [])), 0.0))
+            by, share = nearest(tests, chosen.name, span.length), 1.0
+            if guessed and against:
+                by, share = _mixed(chosen.name, *against), _interpolated(shares, span.length)
+            by = by if by in tests else chosen.name
+            mine.append(Bridge(span, by, tuple(tests.get(by, [])), 0.0, share))
         for span in outer:
             # without a test of its own, an end is at least as uncertain as a model says
             own_test = ends or tests.get(chosen.name, [])
             mine.append(Bridge(span, chosen.name, tuple(own_test), 0.0 if ends else 1.0))
         bridges += mine
-        messages.extend(_choice_words(tests, mine))
+        messages.extend(_choice_words(tests, mine, shares))
         messages.extend(_test_words(mine, level, chosen.name))
     for name, rival in rivals.items():
-        taken = [(bridge.span.start, bridge.span.stop) for bridge in bridges if bridge.by == name]
+        both = (name, _mixed(chosen.name, name))
+        taken = [(bridge.span.start, bridge.span.stop, bridge.share) for bridge in bridges if bridge.by in both]
         for i, path in rival.paths.items():
             paths[i] = _bridged(paths[i], path, grids[i], taken)
     answers = Answers(paths, bridges, settings, slow)
@@ -167,11 +185,48 @@ def _end_tests(
     )
 
 
-def nearest(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, length: float) -> str:
-    """Return which way came nearest to hidden fixes, and was surest, in stretches about as long as this.
+def _mixed(name: str, other: str) -> str:
+    """Return the name of the mean of two ways."""
+    return f"{name} and {other}"
 
-    Another way than the usual one has to be clearly better. Where the sensors speak, it has to be so in the stretches
-    of all lengths together, too: what fixes are wrong by is the same in all, and a few long ones are soon luck.
+
+def _even(spans: Sequence[tuple[float, float]], share: float) -> list[tuple[float, float, float]]:
+    return [(start, stop, share) for start, stop in spans]
+
+
+def _share(
+    first: Sequence[Path], second: Sequence[Path], drives: Sequence[Grid], hidden: Sequence[Grid]
+) -> tuple[float, float]:
+    """Return how long hidden stretches are, and the share of a second path that comes nearest to what was hidden.
+
+    The mean error of each share, over that of the best one, counts for as many stretches as there are; half of each is
+    the guess beforehand.
+    """
+    offs, lengths = [], []
+    for a, b, drive, left in zip(first, second, drives, hidden, strict=True):
+        out = drive.seen & ~left.seen
+        fixes = np.column_stack((drive.east, drive.north))[out]
+        offs.append([np.column_stack((path.east, path.north))[out] - fixes for path in (a, b)])
+        known = set(_pauses(drive))
+        lengths += [stop - start for start, stop in _pauses(left) if (start, stop) not in known]
+    own, other = (np.concatenate([off[k] for off in offs]) for k in (0, 1))
+    errors = np.array([np.hypot(*((1 - share) * own + share * other).T).mean() for share in _SHARES])
+    worth = len(lengths) * errors / max(float(errors.min()), 1e-12) + _EVEN * (_SHARES - 0.5) ** 2
+    worth = np.where(np.isfinite(worth), worth, np.inf)
+    return float(np.median(lengths)), float(_SHARES[int(np.argmin(worth))])
+
+
+def _interpolated(shares: Mapping[float, float], length: float) -> float:
+    """Return the share of the other way in a gap of some length."""
+    lengths = sorted(shares)
+    return float(np.interp(np.log(length), np.log(lengths), [shares[one] for one in lengths])) if lengths else 0.0
+
+
+def nearest(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, length: float) -> str:
+    """Return which way came nearest to hidden fixes, and was surest, where the sensors speak.
+
+    Another way than the usual one has to be clearly better in stretches about as long as this, and in those of all
+    lengths together: what fixes are wrong by is the same in all, and a few long ones are soon luck.
     """
     size = {name: {one.length_s: one.mean_m * one.half_m for one in row} for name, row in tests.items()}
     if usual not in size:
@@ -182,8 +237,7 @@ def nearest(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, length:
         if not common:
             return np.inf
         near = min(common, key=lambda one: abs(np.log(one[0] / max(length, 1e-3))))[1]
-        guessed = any(one.guessed for one in tests[name])
-        return near if guessed else max(near, float(np.exp(np.mean(np.log([max(r, 1e-12) for _, r in common])))))
+        return max(near, float(np.exp(np.mean(np.log([max(r, 1e-12) for _, r in common])))))
 
     best = min((name for name in size if name != usual), key=share, default=usual)
     return best if best != usual and share(best) < _BETTER else usual
@@ -196,15 +250,18 @@ def _pauses(grid: Grid) -> list[tuple[float, float]]:
     return [(float(grid.t[seen[k]]), float(grid.t[seen[k + 1]])) for k in apart]
 
 
-def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, float]]) -> Path:
-    """Take another path between the fixes on both sides of some stretches, shifted so that it meets this one there."""
+def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, float, float]]) -> Path:
+    """Take a share of another path between the fixes on both sides of some stretches, where it is shifted to meet this.
+
+    Each stretch is its beginning, its end and the share. Errors of the two may be alike, so deviations are averaged.
+    """
     seen = np.flatnonzero(grid.seen)
     t = grid.t[seen]
     columns: dict[str, Any] = {name: np.array(getattr(path, name)) for name in ("east", "north", "azimuth", "speed")}
     if path.variance is None or other.variance is None:
         return path
     variance = path.variance.copy()
-    for start, stop in spans:
+    for start, stop, part in spans:
         left = int(np.searchsorted(t, start + 1e-6, side="right")) - 1
         right = int(np.searchsorted(t, stop - 1e-6))
         if left < 0 or right >= seen.size or seen[right] - seen[left] < 2:
@@ -215,11 +272,16 @@ def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, f
         for name, own in columns.items():
             new = getattr(other, name)
             before, after = own[a] - new[a], own[b] - new[b]
+            apart = new[inside] - own[inside]
             if name == "azimuth":
                 before, after = float(wrapped(before)), float(wrapped(after))
-            own[inside] = new[inside] + (1 - share) * before + share * after
+                apart = wrapped(apart + (1 - share) * before + share * after)
+            else:
+                apart = apart + (1 - share) * before + share * after
+            own[inside] += part * apart
         # a path says by itself how far fixes lie about it; what is kept is the sum
-        variance[inside] = np.maximum(other.variance[inside] + other.fix_variance - path.fix_variance, 0.0)
+        new = np.maximum(other.variance[inside] + other.fix_variance - path.fix_variance, 0.0)
+        variance[inside] = ((1 - part) * np.sqrt(variance[inside]) + part * np.sqrt(new)) ** 2
     return replace(path, **columns, variance=variance)
 
 
@@ -232,7 +294,9 @@ def _failed_words(chosen: Method, pieces: Sequence[Piece], n: int) -> str:
     )
 
 
-def _choice_words(tests: Mapping[str, Sequence[calibrate.Tested]], bridges: Sequence[Bridge]) -> list[str]:
+def _choice_words(
+    tests: Mapping[str, Sequence[calibrate.Tested]], bridges: Sequence[Bridge], shares: Mapping[float, float]
+) -> list[str]:
     """Say how near each way came to hidden fixes, where there was a choice, and which was taken."""
     if len(tests) < 2:
         return []
@@ -241,7 +305,9 @@ def _choice_words(tests: Mapping[str, Sequence[calibrate.Tested]], bridges: Sequ
         for row in zip(*tests.values(), strict=False)
     )
     taken = " and ".join(dict.fromkeys(bridge.by for bridge in bridges))
-    return [f"chosen by hiding fixes{_without(bridges[0].span.silent)}: {taken}; mean errors {found}"]
+    parts = ", ".join(f"{100 * shares[length]:.0f} % at {length:.3g} s" for length in sorted(shares))
+    of = f" ({parts} of the second)" if shares else ""
+    return [f"chosen by hiding fixes{_without(bridges[0].span.silent)}: {taken}{of}; mean errors {found}"]
 
 
 def _test_words(bridges: Sequence[Bridge], level: float, usual: str) -> list[str]:

@@ -468,7 +468,7 @@ def _apart(nodes: NDArray[np.intp], parts: Sequence[slice], fits: Sequence[chain
         np.column_stack((fit.path.east, fit.path.north))[nodes - part.start]
         for fit, part in ((fits[0], parts[0]), (fits[-1], parts[-1]))
     )
-    return np.nan_to_num(np.hypot(*(last - first).T), nan=np.inf)
+    return np.asarray(np.nan_to_num(np.hypot(*(last - first).T), nan=np.inf))
 
 
 def _gaps(grid: Grid, seen: NDArray[np.intp]) -> list[_Doubt]:
