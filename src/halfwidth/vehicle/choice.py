@@ -96,8 +96,8 @@ def estimated(
             if all(plausible(path, grids[i]) for i, path in own.items()):
                 rivals[name] = _Rival(own, again)
     bridges: list[Bridge] = []
-    for silent in sorted({span.silent for span in spans}):
-        alike = [span for span in spans if span.silent == silent]
+    for silent, part in sorted({(span.silent, span.part) for span in spans}):
+        alike = [span for span in spans if (span.silent, span.part) == (silent, part)]
         guessed = bool(silent) or not sensed
         against = {name: one for name, one in rivals.items() if (name == "cv") == guessed}
 
@@ -129,7 +129,7 @@ def estimated(
             whole = [grids[i] for i in good]
             lengths = calibrate.lengths_to_test(whole, np.array([span.length for span in alike]))
             z = NormalDist().inv_cdf(0.5 + level / 2)
-            tests = calibrate.tested(whole, filled, lengths, level, z, silent, guessed=guessed)
+            tests = calibrate.tested(whole, filled, lengths, level, z, silent, guessed=guessed, part=part)
         fixes = [grid.t[grid.seen] for grid in grids if grid.seen.any()]
         first_fix, last_fix = min(t[0] for t in fixes), max(t[-1] for t in fixes)
         inner = [s for s in alike if s.start >= first_fix - 1e-6 and s.stop <= last_fix + 1e-6]
@@ -157,7 +157,7 @@ def estimated(
     answers = Answers(paths, bridges, settings, slow)
     settings.update(
         {
-            f"inflation at {one.length_s:.3g} s{_beyond(one)}{_without(one.silent)}{_by(one.by, chosen.name)}": round(
+            f"inflation at {one.length_s:.3g} s{_beyond(one)}{_without(one)}{_by(one.by, chosen.name)}": round(
                 one.inflation, 3
             )
             for one in answers.tested
@@ -307,13 +307,13 @@ def _choice_words(
     taken = " and ".join(dict.fromkeys(bridge.by for bridge in bridges))
     parts = ", ".join(f"{100 * shares[length]:.0f} % at {length:.3g} s" for length in sorted(shares))
     of = f" ({parts} of the second)" if shares else ""
-    return [f"chosen by hiding fixes{_without(bridges[0].span.silent)}: {taken}{of}; mean errors {found}"]
+    return [f"chosen by hiding fixes{_without(bridges[0].span)}: {taken}{of}; mean errors {found}"]
 
 
 def _test_words(bridges: Sequence[Bridge], level: float, usual: str) -> list[str]:
     """Say what hiding fixes showed about gaps of one kind."""
     found = []
-    without = _without(bridges[0].span.silent)
+    without = _without(bridges[0].span)
     groups: dict[object, list[Bridge]] = {}
     for bridge in bridges:
         groups.setdefault((bridge.by, bridge.tested), []).append(bridge)
@@ -351,8 +351,12 @@ def _beyond(one: calibrate.Tested) -> str:
     return " beyond the fixes" if one.side == "one" else ""
 
 
-def _without(silent: Sequence[str]) -> str:
-    return f" without {' and '.join(words(name) for name in silent)}" if silent else ""
+def _without(one: Span | calibrate.Tested) -> str:
+    """Say which sensors are silent, and where."""
+    if not one.silent:
+        return ""
+    where = "" if one.part == (0.0, 1.0) else f" from {100 * one.part[0]:.0f} to {100 * one.part[1]:.0f} % of it"
+    return f" without {' and '.join(words(name) for name in one.silent)}{where}"
 
 
 def _by(name: str, usual: str) -> str:

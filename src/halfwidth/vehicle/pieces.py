@@ -66,6 +66,10 @@ def _gaps(log: Log) -> list[tuple[float, float]]:
     return sorted({*log.gaps(), *((float(times[k]), float(times[k + 1])) for k in long)})
 
 
+#: Share of a quarter of a stretch that a silent sensor may reach into the next one.
+_SLIP = 0.2
+
+
 @dataclass(frozen=True, eq=False)
 class Piece:
     """A part of the drive: the span it answers for, and its grid, which reaches further."""
@@ -112,6 +116,7 @@ class Span:
     start: float
     stop: float
     silent: tuple[str, ...]  # sensors that the log has, but not there
+    part: tuple[float, float] = (0.0, 1.0)  # from where to where they are silent, in quarters of the stretch
 
     @property
     def length(self) -> float:
@@ -129,10 +134,16 @@ def spans_of(log: Log, grid: Grid, chosen: Method, t: Floats, quality: NDArray[n
     for start, stop in ends:
         steps = (grid.t > start) & (grid.t <= stop)
         took = grid.h[steps]
-        silent = tuple(
-            name
+        lost = {
+            name: getattr(grid, f"{name}_sd")[steps] > 0
             for name in chosen.needs + chosen.one_of
-            if getattr(grid, f"has_{name}") and took @ (getattr(grid, f"{name}_sd")[steps] > 0) > 0.5 * took.sum()
-        )
-        spans.append(Span(float(start), float(stop), silent))
+            if getattr(grid, f"has_{name}")
+        }
+        silent = tuple(name for name, rows in lost.items() if took @ rows > 0.5 * took.sum())
+        part = (0.0, 1.0)
+        if silent:
+            rows = np.flatnonzero(np.any([lost[name] for name in silent], axis=0))
+            share = np.concatenate(([0.0], np.cumsum(took))) / took.sum()
+            part = float(np.floor(4 * share[rows[0]] + _SLIP) / 4), float(np.ceil(4 * share[rows[-1] + 1] - _SLIP) / 4)
+        spans.append(Span(float(start), float(stop), silent, part))
     return spans
