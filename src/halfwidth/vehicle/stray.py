@@ -6,9 +6,10 @@ to doubt (the first seconds after a gap, the last ones before it, and what follo
 the doubtful fixes are hidden, and the chain, with the noise that the drive was found to have, says where they should
 have been: after a gap from the fixes after them alone, before it from those before them, so that a gap badly bridged
 proves nothing. What is further off than that can be wrong goes, up to the first fix that agrees again. If none agrees
-the fixes are believed: then the reckoning is wrong, or they are all that is known. They are believed, too, if a jump of
-the receiver's own slow error explains the drive as well (a correction arrives, a satellite is lost): without them the
-path would be bent all the way through the gap. An error that fades (reflections, until enough satellites are back)
+the fixes are believed: then the reckoning is wrong, or they are all that is known. So they are where the sides of a
+jump contradict each other by more than the fixes are off, and where a jump of the receiver's own slow error explains
+the drive as well (a correction arrives, a satellite is lost): without them the path would be bent all the way through
+the gap. An error that fades (reflections, until enough satellites are back)
 never steps and is easily taken for a drift of the slow error: it is looked for by itself (`fade`).
 """
 
