@@ -306,7 +306,7 @@ def _choice_words(
     )
     taken = " and ".join(dict.fromkeys(bridge.by for bridge in bridges))
     parts = ", ".join(f"{100 * shares[length]:.0f} % at {length:.3g} s" for length in sorted(shares))
-    of = f" ({parts} of the second)" if shares else ""
+    of = f" ({parts} of the second)" if any(bridge.share < 1.0 for bridge in bridges) else ""
     return [f"chosen by hiding fixes{_without(bridges[0].span)}: {taken}{of}; mean errors {found}"]
 
 

@@ -64,8 +64,9 @@ _FOLLOW = 8.0
 #: with how many numbers an axis; the logarithm of the odds against them: one gap in ten.
 _SIDE, _WIDE, _SHAPE, _RARE = 60.0, 10.0, 3, 2.2
 
-#: Errors that fade are looked for so long from a gap, s, and felt while they exceed the noise of a fix and this, m.
-_FADING, _FELT_M = 30.0, 0.05
+#: Errors that fade are looked for so long from a gap, s, and felt while they exceed the noise of a fix and this, m; of
+#: what they begin with this share must not be left then, or it is the slow error that goes its way.
+_FADING, _FELT_M, _OVER = 30.0, 0.05, 0.1
 
 #: A gap that lacks a sensor for so long has no reckoning to see a fade by, s.
 _SILENT = 1.0
@@ -277,7 +278,7 @@ class _Search:
         for doubt, nodes, s, fade in zip(doubts, beside, since, found, strict=True):
             left = fade.left(s)
             odds = fade.gain - fade.worth - _RARE
-            if odds > 0 and left.max() > felt:
+            if odds > 0 and left.max() > felt and left.min() < max(_OVER * left.max(), felt):
                 hope[doubt] = fade, _Wrong(odds, nodes[left > felt], left[left > felt])
         against = self._against(list(hope), [wrong.nodes for _, wrong in hope.values()])
         rival = self._odds(self._clearest(list(hope)))
