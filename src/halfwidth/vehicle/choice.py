@@ -272,13 +272,10 @@ def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, f
         for name, own in columns.items():
             new = getattr(other, name)
             before, after = own[a] - new[a], own[b] - new[b]
-            apart = new[inside] - own[inside]
             if name == "azimuth":
                 before, after = float(wrapped(before)), float(wrapped(after))
-                apart = wrapped(apart + (1 - share) * before + share * after)
-            else:
-                apart = apart + (1 - share) * before + share * after
-            own[inside] += part * apart
+            apart = new[inside] + (1 - share) * before + share * after - own[inside]
+            own[inside] += part * (wrapped(apart) if name == "azimuth" else apart)
         # a path says by itself how far fixes lie about it; what is kept is the sum
         new = np.maximum(other.variance[inside] + other.fix_variance - path.fix_variance, 0.0)
         variance[inside] = ((1 - part) * np.sqrt(variance[inside]) + part * np.sqrt(new)) ** 2
