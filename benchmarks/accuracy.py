@@ -17,7 +17,8 @@ that was best on these starts in hindsight. Then ratios with their standard erro
     others best    `fill` over the method that is best on all the other starts, which is no luck;
     linear         `fill` over straight lines, mean / maxima.
 
-The slowest methods, which never are the best, are left out unless `--methods` has them.
+With `--silent` the named streams are hidden in these stretches as well. The slowest methods, which never are the best,
+are left out unless `--methods` has them.
 """
 
 import argparse
