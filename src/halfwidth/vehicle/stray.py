@@ -455,15 +455,6 @@ def _unusual(usual: Floats) -> float:
     return max(1.0, _MARGIN * float(np.quantile(usual, _QUANTILE)) / FAR if enough else _UNKNOWN)
 
 
-def _off(grid: Grid, nodes: NDArray[np.intp], part: slice, fit: chain.Fit) -> tuple[Floats, Floats]:
-    """Return how far the fixes at some nodes are off a path, and the standard deviation of that, m."""
-    path, own = fit.path, nodes - part.start
-    if not path.finite or path.variance is None or not path.status.good:
-        return np.zeros(nodes.size), np.ones(nodes.size)
-    distance = np.hypot(path.east[own] - grid.east[nodes], path.north[own] - grid.north[nodes])
-    return distance, np.sqrt(path.variance[own].mean(axis=1) + path.fix_variance)
-
-
 def _apart(nodes: NDArray[np.intp], parts: Sequence[slice], fits: Sequence[chain.Fit]) -> Floats:
     """Return how far the first and the last of some paths are apart at some nodes, m."""
     first, last = (
@@ -471,6 +462,15 @@ def _apart(nodes: NDArray[np.intp], parts: Sequence[slice], fits: Sequence[chain
         for fit, part in ((fits[0], parts[0]), (fits[-1], parts[-1]))
     )
     return np.asarray(np.nan_to_num(np.hypot(*(last - first).T), nan=np.inf))
+
+
+def _off(grid: Grid, nodes: NDArray[np.intp], part: slice, fit: chain.Fit) -> tuple[Floats, Floats]:
+    """Return how far the fixes at some nodes are off a path, and the standard deviation of that, m."""
+    path, own = fit.path, nodes - part.start
+    if not path.finite or path.variance is None or not path.status.good:
+        return np.zeros(nodes.size), np.ones(nodes.size)
+    distance = np.hypot(path.east[own] - grid.east[nodes], path.north[own] - grid.north[nodes])
+    return distance, np.sqrt(path.variance[own].mean(axis=1) + path.fix_variance)
 
 
 def _gaps(grid: Grid, seen: NDArray[np.intp]) -> list[_Doubt]:
