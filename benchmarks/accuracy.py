@@ -1,19 +1,29 @@
-"""Print how far off each method fills outages of real logs, and how often the half-widths of `fill` hold.
+"""Print how far off each method fills outages of real logs, and how `fill` does beside them.
 
     python benchmarks/accuracy.py [FOLDER OF LOGS] [--starts 20] [--seed 1] [--methods linear,em] [--lengths 1,5,30]
-                                  [--tracks 20]
+                                  [--tracks 20] [--fair] [--silent speed_mps]
 
 Nothing is told of a log: clocks, scale and bias of its sensors are found from it. The first table of each log is that
 of `halfwidth outages`; the second one, where numbers are asked of the log, sets the chain beside them, in metres and as
-a share of the error of a straight line on the same starts, since twenty random starts differ by more than methods do;
-the third hides one stretch at a time from `fill` and compares its track with the hidden fixes. The last one sets that
-track beside the single method that was best on the same starts, in hindsight, and beside straight lines: ratios of mean
-errors and of means of maxima. The best of many methods on twenty starts is partly luck, so read a ratio with the
-standard error of the differences from start to start behind it.
+a share of the error of a straight line on the same starts, since twenty random starts differ by more than methods do.
+
+The last table, the only one with `--fair`, hides the same stretches from the log before anything is learnt of it,
+several far apart at a time, and fills what is left by `fill` and by each single method, `fill(method=...)`: mean and
+mean of maxima of `fill`, how often its half-widths hold, how wide they are, the seconds a track takes, and the method
+that was best on these starts in hindsight. Then ratios with their standard errors, from the differences start by start:
+
+    mean, maxima   `fill` over the best method, of means and of means of maxima. The best of many methods on twenty
+                   starts is partly luck, so this is above 1 even where no method is better;
+    others best    `fill` over the method that is best on all the other starts, which is no luck;
+    linear         `fill` over straight lines, mean / maxima.
+
+With `--silent` the named streams are hidden in these stretches as well. The slowest methods, which never are the best,
+are left out unless `--methods` has them.
 """
 
 import argparse
 import time
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import hidden
@@ -21,12 +31,22 @@ import numpy as np
 
 import halfwidth as hw
 from halfwidth.vehicle.align import calibrated
+from halfwidth.vehicle.choice import estimated
+from halfwidth.vehicle.estimators import method
+from halfwidth.vehicle.fill import prepared, read_off
 from halfwidth.vehicle.grid import sampled
 from halfwidth.vehicle.outage import LENGTHS
 from halfwidth.vehicle.stamps import restamped
 
 #: How much worse than the best single method `fill` may be.
 WORSE = 1.05
+
+#: Name of `fill` among the methods, and those that it is set beside.
+FILL = "fill"
+BESIDE = (
+    *("em", "em-slow", "em-white", "linear", "cv", "gpsins", "ctrv", "slp", "slp-white"),
+    *("paper000", "paper000+ls", "paper002lin"),
+)
 
 #: Asked of the default method by the start of a log's name and by length: mean and mean of maxima, m, and those of a
 #: straight line on the starts they were asked for.
@@ -63,65 +83,114 @@ def asked_of(name, found):
     print()
 
 
-def held(log, found, lengths, most):
-    """Hide one stretch at a time from `fill`; print error, share inside, and width; return errors by length."""
-    nodes = sampled(log, sensors=calibrated(log))
-    times = nodes.t[nodes.seen]  # the fixes that `outages` compares with
-    print(f"{'fill':12}{'tracks':>8}{'m':>16}{'inside':>9}{'half-width m':>14}{'s a track':>11}")
-    errors = {}
-    for length in lengths:
-        begin = next((cell.start for cell in found.cells if cell.length == length), np.empty(0))[:most]
-        means, largest, counts, inside, widths, seconds, which = [], [], [], [], [], [], []
-        for k, t0 in enumerate(begin):
-            clock = time.process_time()
-            track = hw.vehicle.fill(hidden.without(log, [t0], length))
-            seconds.append(time.process_time() - clock)
+@dataclass
+class Beside:
+    """Errors of the track of `fill` and of single methods at one length, start by start."""
+
+    start: list = field(default_factory=list)
+    count: list = field(default_factory=list)
+    means: dict = field(default_factory=dict)
+    maxima: dict = field(default_factory=dict)
+    inside: list = field(default_factory=list)
+    widths: list = field(default_factory=list)
+    seconds: list = field(default_factory=list)
+
+    def add(self, way, off):
+        distance = np.hypot(off[:, 0], off[:, 1])
+        self.means.setdefault(way, []).append(distance.mean())
+        self.maxima.setdefault(way, []).append(distance.max())
+
+
+def by_method(ready, name):
+    """Return the positions (M, 2) of the rows of a track that one method fills; half-widths are not asked for."""
+    answers = estimated(ready.pieces, method(name), (), 0.9, [], free=False)
+    columns = read_off(answers, ready.pieces, ready.t)
+    return ready.grid.frame.to_geodetic(*ready.antenna(columns.east, columns.north))
+
+
+def beside(log, begins, length, methods, times, silent):
+    """Hide stretches, several far apart at a time, and fill the very same logs by `fill` and by each method."""
+    found = Beside()
+    for group in hidden.groups(begins, length):
+        left = hidden.without(log, group, length, silent)
+        clock = time.process_time()
+        track = hw.vehicle.fill(left)
+        found.seconds.append(time.process_time() - clock)
+        ready = prepared(left, [])
+        ways = {name: by_method(ready, name) for name in methods}
+        for t0 in group:
             off, half, _ = hidden.compared(log, track, t0, length, times)
             if not off.size:
                 continue
-            distance = np.hypot(off[:, 0], off[:, 1])
-            means.append(distance.mean())
-            largest.append(distance.max())
-            counts.append(len(off))
-            inside.append(np.mean(np.abs(off) <= half))
-            widths.append(half.mean())
-            which.append(k)
-        if which:
-            errors[length] = tuple(np.array(v) for v in (which, means, largest, counts))
-            both = f"{np.average(means, weights=counts):.2f} / {np.mean(largest):.2f}"
-            print(
-                f"{length:>8g} s  {len(which):>8}{both:>16}{np.mean(inside):>9.2f}"
-                f"{np.mean(widths):>14.2f}{np.median(seconds):>11.2f}",
-                flush=True,
-            )
-    return errors
+            found.start.append(t0)
+            found.count.append(len(off))
+            found.add(FILL, off)
+            found.inside.append(np.mean(np.abs(off) <= half))
+            found.widths.append(half.mean())
+            for name, (lat, lon) in ways.items():
+                found.add(name, hidden.compared(log, replace(track, lat_deg=lat, lon_deg=lon), t0, length, times)[0])
+    return found
 
 
-def compared(found, errors):
-    """Print the track of `fill` beside the best single method and straight lines, on the same starts."""
+def ratio(own, other, weight):
+    """Return the ratio of two means and the standard error of that from the differences, start by start."""
+    a, b = np.average(own, weights=weight), np.average(other, weights=weight)
+    share = weight / weight.sum() * len(weight)
+    apart = share * (own - a / b * other)
+    error = apart.std(ddof=1) / np.sqrt(len(weight)) / b if len(weight) > 1 else float("nan")
+    return a / b, error
+
+
+def others_best(errors, weight):
+    """Return for each start the error of the method that is best on all the other starts."""
+    names = list(errors)
+    table = np.array([errors[name] for name in names])
+    sums = (table * weight).sum(axis=1)
+    return np.array([table[np.argmin(sums - table[:, k] * weight[k]), k] for k in range(len(weight))])
+
+
+def compared(log, found, lengths, most, methods, silent):
+    """Print the track of `fill` beside the single methods on the very same logs, with the same fixes hidden."""
+    nodes = sampled(log, sensors=calibrated(log))
+    times = nodes.t[nodes.seen]  # the fixes that `outages` compares with
     print(
-        f"\n{'':10}{'starts':>7}{'fill':>16}{'best of the methods':>32}{'ratio':>15}{'s.e.':>7}{'linear':>18}{'ratio':>15}"
+        f"{'fill':8}{'starts':>7}{'m':>14}{'inside':>8}{'half m':>8}{'s':>6}   {'best method':>30}"
+        f"{'mean':>14}{'maxima':>14}{'others best':>14}{'linear':>14}"
     )
     beyond = []
-    for length, (which, mean, largest, n) in errors.items():
-        cells = {name: found.cell(name, length) for name in found.methods}
-        means = {name: float(np.average(c.mean_error[which], weights=n)) for name, c in cells.items()}
-        tops = {name: float(c.max_error[which].mean()) for name, c in cells.items()}
-        own, top = float(np.average(mean, weights=n)), float(largest.mean())
-        best, best_top = min(means, key=means.get), min(tops, key=tops.get)
-        ratio = own / means[best], top / tops[best_top]
-        apart = mean - cells[best].mean_error[which]
-        error = apart.std(ddof=1) / np.sqrt(apart.size) / means[best] if apart.size > 1 else float("nan")
+    for length in lengths:
+        begins = next((cell.start for cell in found.cells if cell.length == length), np.empty(0))[:most]
+        if not len(begins):
+            continue
+        one = beside(log, begins, length, methods, times, silent)
+        if not one.start:
+            continue
+        n, alike = np.array(one.count, dtype=float), np.ones(len(one.start))
+        means = {name: np.array(v) for name, v in one.means.items()}
+        maxima = {name: np.array(v) for name, v in one.maxima.items()}
+        own, top = means.pop(FILL), maxima.pop(FILL)
+        best = min(means, key=lambda name: np.average(means[name], weights=n))
+        best_top = min(maxima, key=lambda name: maxima[name].mean())
+        pairs = {
+            "mean": ratio(own, means[best], n),
+            "maxima": ratio(top, maxima[best_top], alike),
+            "others": ratio(own, others_best(means, n), n),
+        }
+        line = ratio(own, means["linear"], n)[0], ratio(top, maxima["linear"], alike)[0]
         names = best if best == best_top else f"{best}, {best_top}"
-        line = own / means["linear"], top / tops["linear"]
+        words = f"{names} {np.average(means[best], weights=n):.3f} / {maxima[best_top].mean():.3f}"
         print(
-            f"{length:>8g} s{len(which):>7}{f'{own:.2f} / {top:.2f}':>16}"
-            f"{f'{names} {means[best]:.2f} / {tops[best_top]:.2f}':>32}{f'{ratio[0]:.2f} / {ratio[1]:.2f}':>15}{error:>7.2f}"
-            f"{means['linear']:>9.2f} /{tops['linear']:>7.2f}{f'{line[0]:.2f} / {line[1]:.2f}':>15}",
+            f"{length:>6g} s{len(n):>7}{f'{np.average(own, weights=n):.3f} / {top.mean():.3f}':>14}"
+            f"{np.mean(one.inside):>8.2f}{np.mean(one.widths):>8.2f}{np.median(one.seconds):>6.2f}   {words:>30}"
+            + "".join(f"{f'{a:.2f} +- {e:.2f}':>14}" for a, e in pairs.values())
+            + f"{f'{line[0]:.2f} / {line[1]:.2f}':>14}",
             flush=True,
         )
-        if max(ratio) > WORSE or max(line) > 1.0:
+        if max(pairs["mean"][0], pairs["maxima"][0]) > WORSE or max(line) > 1.0:
             beyond.append(f"{length:g} s")
+        if best != "em" and "em" in means:
+            beside_em = ratio(own, means["em"], n)[0], ratio(top, maxima["em"], alike)[0]
+            print(f"{'':8}em alone: fill is {beside_em[0]:.2f} / {beside_em[1]:.2f} of it")
     print(f"beyond {WORSE:g} times the best single method or worse than linear: {', '.join(beyond) or 'no cell'}")
 
 
@@ -134,6 +203,8 @@ def main():
     parser.add_argument("--methods", default=None)
     parser.add_argument("--lengths", default=",".join(f"{length:g}" for length in LENGTHS))
     parser.add_argument("--tracks", type=int, default=20, help="stretches of each length hidden from fill")
+    parser.add_argument("--fair", action="store_true", help="only the last table")
+    parser.add_argument("--silent", help="streams hidden there as well: speed_mps,yaw_rate_radps")
     asked = parser.parse_args()
     lengths = tuple(float(length) for length in asked.lengths.split(","))
     methods = None if asked.methods is None else asked.methods.split(",")
@@ -143,14 +214,15 @@ def main():
     for path in logs:
         # `outages` puts a log right that was written late; its starts are on that clock
         log = restamped(hw.vehicle.read(path))[0]
-        print(f"\n=== {path.name}")
-        found = hw.vehicle.outages(log, lengths, asked.starts, asked.seed, methods)
-        print(found, end="\n\n", flush=True)
-        asked_of(path.name, found)
+        print(f"\n=== {path.name}: seed {asked.seed}")
+        found = hw.vehicle.outages(log, lengths, asked.starts, asked.seed, ("linear",) if asked.fair else methods)
+        if not asked.fair:
+            print(found, end="\n\n", flush=True)
+            asked_of(path.name, found)
         if asked.tracks:
-            errors = held(log, found, lengths, asked.tracks)
-            if "linear" in found.methods:
-                compared(found, errors)
+            compared(
+                log, found, lengths, asked.tracks, methods or BESIDE, asked.silent.split(",") if asked.silent else ()
+            )
 
 
 if __name__ == "__main__":

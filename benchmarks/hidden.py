@@ -1,15 +1,35 @@
 """Hide fixes of a log, and compare a track with them: what the benchmarks of `fill` share."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from halfwidth.vehicle.frames import Frame
 
+#: Fixes left between two stretches that are hidden at once, s.
+APART = 40.0
 
-def without(log, begins, length):
-    """Return a log without the fixes of some stretches of one length."""
+
+def without(log, begins, length, silent=()):
+    """Return a log without the fixes of some stretches of one length, nor what the named streams say there."""
     for begin in begins:
         log = log.without(begin, begin + length)
+        inside = (log.t >= begin) & (log.t <= begin + length)
+        log = replace(log, **{name: np.where(inside, np.nan, getattr(log, name)) for name in silent})
     return log
+
+
+def groups(begins, length):
+    """Divide stretches into groups that can be hidden at once: none is nearer to another than `APART`."""
+    divided = []
+    for begin in begins:
+        room = (group for group in divided if all(abs(begin - other) >= length + APART for other in group))
+        group = next(room, None)
+        if group is None:
+            divided.append([begin])
+        else:
+            group.append(begin)
+    return divided
 
 
 def compared(log, track, begin, length, times=None):

@@ -356,3 +356,20 @@ def test_a_jump_of_the_slow_error_beside_a_gap_is_no_fault(data, begin, length):
     log = read(next(data.glob("smartloc*.csv.gz"))).without(begin, begin + length)
     known = calibrated(log)
     assert strays(sampled(log, sensors=known), known).at.size == 0
+
+
+@pytest.mark.parametrize(("begin", "seconds", "factor"), [(30.0, 6.0, 0.4), (50.0, 4.0, 0.3), (170.0, 8.0, 0.6)])
+def test_fixes_are_believed_where_the_speed_is_wrong(drive, begin, seconds, factor):
+    _, log = drive
+    inside = (log.t > begin) & (log.t <= begin + seconds)
+    spoiled = replace(log, speed_mps=np.where(inside, factor * log.speed_mps, log.speed_mps))
+    sensors = calibrated(spoiled)
+    assert strays(sampled(spoiled, sensors=sensors), sensors).at.size == 0
+    # a fix that is as far off as the speed is wrong shows nevertheless
+    rows = after(log, begin + 40.0, 2.0)
+    both = shifted(spoiled, rows, 40.0)
+    grid = sampled(both, sensors=sensors)
+    found = grid.t[strays(grid, sensors).at]
+    there = grid.t[grid.seen & (grid.t > begin + 40.0) & (grid.t <= begin + 42.0)]
+    assert np.isin(there, found).mean() >= 0.9
+    assert np.all((found > begin + 39.7) & (found < begin + 42.3))

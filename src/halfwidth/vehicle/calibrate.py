@@ -117,6 +117,8 @@ class Tested:
         independent errors that rests on.
     guessed : bool
         Whether what the vehicle did was guessed for lack of a sensor: longer gaps are then another thing.
+    part : (float, float)
+        From where to where these sensors were hidden, as shares of a stretch.
     """
 
     length_s: float
@@ -131,6 +133,7 @@ class Tested:
     side: str = "both"
     asked: tuple[tuple[float, float, float], ...] = ()
     guessed: bool = False
+    part: tuple[float, float] = (0.0, 1.0)
 
 
 def lengths_to_test(drives: Sequence[Grid], gaps: Floats) -> list[float]:
@@ -185,6 +188,7 @@ def tested(
     silent: tuple[str, ...],
     *,
     guessed: bool,
+    part: tuple[float, float],
 ) -> dict[str, list[Tested]]:
     """Hide stretches of each length and see what widening the interval needs.
 
@@ -204,6 +208,8 @@ def tested(
         Sensors that are hidden with the fixes.
     guessed : bool
         Whether what the vehicle does in a stretch is guessed for lack of a sensor.
+    part : (float, float)
+        From where to where the sensors are hidden, as shares of a stretch.
 
     Returns
     -------
@@ -220,14 +226,14 @@ def tested(
         for phase in range(PHASES):
             if sum(len(case[3]) for case in cases) >= ENOUGH:
                 break
-            every_part = [(i, drive, _hidden(drive, length, phase / PHASES, silent)) for i, drive in parts]
+            every_part = [(i, drive, _hidden(drive, length, phase / PHASES, silent, part)) for i, drive in parts]
             cases += [(i, drive, *hidden) for i, drive, hidden in every_part if hidden is not None]
         if not cases:
             continue
         for by, paths in rerun([case[0] for case in cases], [case[2] for case in cases]).items():
             one = _judged(cases, paths, length, level, z, _PER_GUESS if guessed else _PER_STRETCH, room)
             if one is not None:
-                by_way.setdefault(by, []).append(replace(one, silent=silent, by=by, guessed=guessed))
+                by_way.setdefault(by, []).append(replace(one, silent=silent, by=by, guessed=guessed, part=part))
     return {by: _sized(found, level) for by, found in by_way.items() if _enough(found)}
 
 
@@ -235,7 +241,9 @@ def _enough(found: Sequence[Tested]) -> bool:
     return max((one.stretches for one in found), default=0) >= FEWEST
 
 
-def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -> tuple[Grid, list[slice]] | None:
+def _hidden(
+    drive: Grid, length: float, phase: float, silent: tuple[str, ...], part: tuple[float, float] = (0.0, 1.0)
+) -> tuple[Grid, list[slice]] | None:
     """Hide stretches of one length, evenly spread; return the grid and the nodes of each stretch."""
     t, seen = drive.t, drive.seen
     fixes = t[seen]
@@ -255,7 +263,13 @@ def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -
         if whole and moves:
             mask[a:b] = True
             stretches.append(slice(a, b))
-    return (drive.masked(mask, silent), stretches) if stretches else None
+    if not stretches:
+        return None
+    lost = np.zeros(t.size, dtype=bool)
+    for own in stretches:
+        share = (t[own] - t[own][0]) / max(length, 1e-9)
+        lost[own] = (share >= part[0] - 1e-9) & (share <= part[1] + 1e-9)
+    return drive.masked(lost, silent).masked(mask), stretches
 
 
 def tested_ends(

@@ -6,9 +6,10 @@ to doubt (the first seconds after a gap, the last ones before it, and what follo
 the doubtful fixes are hidden, and the chain, with the noise that the drive was found to have, says where they should
 have been: after a gap from the fixes after them alone, before it from those before them, so that a gap badly bridged
 proves nothing. What is further off than that can be wrong goes, up to the first fix that agrees again. If none agrees
-the fixes are believed: then the reckoning is wrong, or they are all that is known. They are believed, too, if a jump of
-the receiver's own slow error explains the drive as well (a correction arrives, a satellite is lost): without them the
-path would be bent all the way through the gap. An error that fades (reflections, until enough satellites are back)
+the fixes are believed: then the reckoning is wrong, or they are all that is known. So they are where the sides of a
+jump contradict each other by more than the fixes are off, and where a jump of the receiver's own slow error explains
+the drive as well (a correction arrives, a satellite is lost): without them the path would be bent all the way through
+the gap. An error that fades (reflections, until enough satellites are back)
 never steps and is easily taken for a drift of the slow error: it is looked for by itself (`fade`).
 """
 
@@ -55,8 +56,9 @@ _FOLLOW = 8.0
 #: with how many numbers an axis; the logarithm of the odds against them: one gap in ten.
 _SIDE, _WIDE, _SHAPE, _RARE = 60.0, 10.0, 3, 2.2
 
-#: Errors that fade are looked for so long from a gap, s, and felt while they exceed the noise of a fix and this, m.
-_FADING, _FELT_M = 30.0, 0.05
+#: Errors that fade are looked for so long from a gap, s, and felt while they exceed the noise of a fix and this, m; of
+#: what they begin with this share must not be left then, or it is the slow error that goes its way.
+_FADING, _FELT_M, _OVER = 30.0, 0.05, 0.1
 
 #: A gap that lacks a sensor for so long has no reckoning to see a fade by, s.
 _SILENT = 1.0
@@ -159,6 +161,7 @@ class _Answer:
     length: float
     nodes: NDArray[np.intp]  # of the doubtful fixes
     off: list[tuple[Floats, Floats]]  # how far they are off, and the standard deviation of that, for each side asked
+    apart: Floats  # how far what the sides say is apart, 0 where one was asked
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +255,7 @@ class _Search:
         for doubt, nodes, s, fade in zip(doubts, beside, since, found, strict=True):
             left = fade.left(s)
             odds = fade.gain - fade.worth - _RARE
-            if odds > 0 and left.max() > felt:
+            if odds > 0 and left.max() > felt and left.min() < max(_OVER * left.max(), felt):
                 hope[doubt] = fade, _Wrong(odds, nodes[left > felt], left[left > felt])
         against = self._against(list(hope), [wrong.nodes for _, wrong in hope.values()])
         rival = self._odds(self._clearest(list(hope)))
@@ -303,10 +306,12 @@ class _Search:
         if not hidden:
             return []
         fits = iter(chain.solve(hidden, self.settings, sigma=self.noise, learn=False))
-        return [
-            _Answer(doubt, length, nodes, [_off(self.grid, nodes, part, next(fits)) for part in parts])
-            for doubt, length, nodes, parts in asked
-        ]
+        answers = []
+        for doubt, length, nodes, parts in asked:
+            said = [next(fits) for _ in parts]
+            off = [_off(self.grid, nodes, part, fit) for part, fit in zip(parts, said, strict=True)]
+            answers.append(_Answer(doubt, length, nodes, off, _apart(nodes, parts, said)))
+        return answers
 
     def _odds(self, found: dict[Doubt, "_Wrong"]) -> dict[Doubt, float]:
         """Return how much better wrong fixes explain the drive than a jump of the receiver's slow error, as logarithms.
@@ -427,6 +432,15 @@ def _unusual(usual: Floats) -> float:
     return max(1.0, _MARGIN * float(np.quantile(usual, _QUANTILE)) / FAR if enough else _UNKNOWN)
 
 
+def _apart(nodes: NDArray[np.intp], parts: Sequence[slice], fits: Sequence[chain.Fit]) -> Floats:
+    """Return how far the first and the last of some paths are apart at some nodes, m."""
+    first, last = (
+        np.column_stack((fit.path.east, fit.path.north))[nodes - part.start]
+        for fit, part in ((fits[0], parts[0]), (fits[-1], parts[-1]))
+    )
+    return np.asarray(np.nan_to_num(np.hypot(*(last - first).T), nan=np.inf))
+
+
 def _off(grid: Grid, nodes: NDArray[np.intp], part: slice, fit: chain.Fit) -> tuple[Floats, Floats]:
     """Return how far the fixes at some nodes are off a path, and the standard deviation of that, m."""
     path, own = fit.path, nodes - part.start
@@ -440,8 +454,12 @@ def _wrong(answer: _Answer, times: float) -> Mask:
     """Return which of the doubted fixes are wrong: from the first on, up to where they agree again.
 
     They are wrong if all that were asked say so, by so many times the usual; the last one asked says where they agree.
+    Where the sides contradict each other more than the fixes, it is the reckoning that is wrong.
     """
-    far = np.all([(distance > times * FAR * sd) & (distance > FAR_M) for distance, sd in answer.off], axis=0)
+    far = np.all(
+        [(distance > times * FAR * sd) & (distance > np.maximum(FAR_M, answer.apart)) for distance, sd in answer.off],
+        axis=0,
+    )
     distance, sd = answer.off[-1]
     near = distance < np.maximum(times * NEAR * sd, FAR_M)
     if answer.doubt.backwards:
