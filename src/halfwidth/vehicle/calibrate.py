@@ -14,9 +14,9 @@ read together: the logarithm of the factor is taken to be
     log factor(s, L) = a + f(log s) + g(log L)
 
 with a Gaussian, f and g Ornstein-Uhlenbeck processes (`_SIZE`, `_BY_SD`, `_BY_LENGTH`), seen in each group with the
-variance of a sample quantile of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n. For n a stretch counts as four (two
-axes, two halves), or as one where a sensor is missing; groups near each other share their noise, as they come from the
-same places. That gives the factor for any s and L, and the variance v of its logarithm. A scale known from n
+variance of a sample quantile of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n. For n a stretch counts as two in each
+group (its axes; what one place of it is off by, the next one is too), or as one where a sensor is missing; groups near
+each other share their noise, as they come from the same places. That gives the factor for any s and L, and the variance v of its logarithm. A scale known from n
 independent errors has v = 1 / (2 n), and the interval is then Student's: the factor is multiplied by
 t(level, 1 / (2 v)) / z, so that few stretches give a wide interval and not a lucky one. This is an observed frequency
 on this log, no guarantee.
@@ -54,9 +54,10 @@ END_WINDOWS, END_CONTEXT = 16, 30.0
 #: Nodes of the parts of a log that are tested, about.
 MOST_NODES = 20_000
 
-#: Errors of one stretch that count as independent: where sensors carry the path through it, and where what the
-#: vehicle did is guessed, so that one wrong guess makes all of the stretch wrong.
-_PER_STRETCH, _PER_GUESS = 4, 1
+#: Errors of one stretch that count as independent: where sensors carry the path through it (two axes, two halves),
+#: those of them in one group, and where what the vehicle did is guessed, so that one wrong guess makes all of the
+#: stretch wrong.
+_PER_STRETCH, _PER_GROUP, _PER_GUESS = 4, 2, 1
 
 #: Groups of hidden fixes of one length; one where what the vehicle did is guessed.
 GROUPS = 4
@@ -225,7 +226,7 @@ def tested(
         if not cases:
             continue
         for by, paths in rerun([case[0] for case in cases], [case[2] for case in cases]).items():
-            one = _judged(cases, paths, length, level, z, _PER_GUESS if guessed else _PER_STRETCH, room)
+            one = _judged(cases, paths, length, level, z, _PER_GUESS if guessed else _PER_GROUP, room)
             if one is not None:
                 by_way.setdefault(by, []).append(replace(one, silent=silent, by=by, guessed=guessed))
     return {by: _sized(found, level) for by, found in by_way.items() if _enough(found)}
@@ -242,12 +243,16 @@ def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -
     if fixes.size < 5:
         return None
     period = _period(length)
-    begin = np.arange(fixes[0] + EDGE + phase * period, fixes[-1] - EDGE - length, period)
     usual = float(np.median(np.diff(fixes)))
+    # from one fix to the next that is left it is as long as a gap of this length: the nodes between them are hidden
+    even = np.arange(fixes[0] + EDGE + phase * period, fixes[-1] - EDGE - length, period)
+    begin = fixes[np.searchsorted(fixes, even)]
+    begin = begin[begin - even <= 1.5 * usual]
+    slack = 1e-3 * usual
     moved = np.concatenate(([0.0], np.cumsum(np.abs(drive.speed[1:]) * np.diff(t))))
     mask, stretches = np.zeros(t.size, dtype=bool), []
     for t0 in begin:
-        a, b = int(np.searchsorted(t, t0)), int(np.searchsorted(t, t0 + length, side="right"))
+        a, b = int(np.searchsorted(t, t0 + slack)), int(np.searchsorted(t, t0 + length - slack))
         inside = t[a:b][seen[a:b]]
         # a stretch that already lacks fixes is no test, nor is standing still
         whole = inside.size > 0 and inside.size >= 0.8 * length / usual - 1
@@ -351,7 +356,7 @@ def _judged(
     n = len(factors)
     if n == 0:
         return None
-    errors = _independent(n, length, room, independent)
+    groups = GROUPS if independent == _PER_GROUP else 1
     return Tested(
         length,
         n,
@@ -360,7 +365,7 @@ def _judged(
         float(np.mean(inside)),
         1.0,
         half_m=float(np.mean(halves)),
-        asked=_asked(factors, sds, level, errors, GROUPS if independent == _PER_STRETCH else 1),
+        asked=_asked(factors, sds, level, _independent(n, length, room, independent), groups),
     )
 
 
