@@ -78,7 +78,7 @@ def bound(
     fits(model, record)
     T = len(record)
     wanted = np.arange(T) if at is None else np.atleast_1d(np.asarray(at))
-    if wanted.ndim != 1 or not np.issubdtype(wanted.dtype, np.integer) or not ((-T <= wanted) & (wanted < T)).all():
+    if wanted.ndim != 1 or not np.issubdtype(wanted.dtype, np.integer) or not ((wanted >= -T) & (wanted < T)).all():
         raise BadValue(f"`at` is {at!r}, rows from {-T} to {T - 1} were expected")
     single = functional_of(c, model.nx) if np.ndim(c) < 2 else None
     rows = (

@@ -14,10 +14,11 @@ read together: the logarithm of the factor is taken to be
     log factor(s, L) = a + f(log s) + g(log L)
 
 with a Gaussian, f and g Ornstein-Uhlenbeck processes (`_SIZE`, `_BY_SD`, `_BY_LENGTH`), seen in each group with the
-variance of a sample quantile of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n. For n a stretch counts as two in each
-group (its axes; what one place of it is off by, the next one is too), or as one where a sensor is missing; groups near
-each other share their noise, as they come from the same places. That gives the factor for any s and L, and the variance v of its logarithm. A scale known from n
-independent errors has v = 1 / (2 n), and the interval is then Student's: the factor is multiplied by
+variance of a sample quantile of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n. For n a stretch counts as two in
+each group (its axes; what one place of it is off by, the next one is too), or as one where a sensor is missing; groups
+near each other share their noise, as they come from the same places. That gives the factor for any s and L, and the
+variance v of its logarithm. A scale known from n independent errors has v = 1 / (2 n), and the interval is then
+Student's: the factor is multiplied by
 t(level, 1 / (2 v)) / z, so that few stretches give a wide interval and not a lucky one. This is an observed frequency
 on this log, no guarantee.
 
@@ -40,13 +41,16 @@ Floats = NDArray[np.float64]
 
 #: Lengths at most at which the log is tested, each this many times the next; shifted repetitions of each test at most,
 #: and stretches that are enough without another one.
-MOST_LENGTHS, RATIO, PHASES, ENOUGH = 5, 2.0, 3, 40
+MOST_LENGTHS, RATIO, PHASES, ENOUGH = 5, 2.0, 5, 40
 
 #: Fixes that a log needs for a test.
 FEWEST_FIXES = 16
 
 #: Fixes left between hidden stretches and at the ends, s, at least; and stretches of one length that are a test.
 BETWEEN, EDGE, FEWEST = 15.0, 3.0, 3
+
+#: Fixes of a drive without which nothing of it is hidden.
+_FEWEST_HIDDEN = 5
 
 #: Windows cut out of a log to test how far off a path gets beyond the last fix, about, and their fixes, s.
 END_WINDOWS, END_CONTEXT = 16, 30.0
@@ -215,8 +219,8 @@ def tested(
     # a long log is tested on parts of it, evenly spread
     every = max(1, round(sum(len(drive) for drive in drives) / MOST_NODES))
     parts = list(enumerate(drives))[::every]
-    room = sum(float(np.ptp(drive.t[drive.seen])) for _, drive in parts if drive.seen.any())
     for length in lengths:
+        room = sum(_room(drive, length) for _, drive in parts)
         cases: list[_Case] = []
         for phase in range(PHASES):
             if sum(len(case[3]) for case in cases) >= ENOUGH:
@@ -240,14 +244,11 @@ def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -
     """Hide stretches of one length, evenly spread; return the grid and the nodes of each stretch."""
     t, seen = drive.t, drive.seen
     fixes = t[seen]
-    if fixes.size < 5:
+    if fixes.size < _FEWEST_HIDDEN:
         return None
-    period = _period(length)
     usual = float(np.median(np.diff(fixes)))
     # from one fix to the next that is left it is as long as a gap of this length: the nodes between them are hidden
-    even = np.arange(fixes[0] + EDGE + phase * period, fixes[-1] - EDGE - length, period)
-    begin = fixes[np.searchsorted(fixes, even)]
-    begin = begin[begin - even <= 1.5 * usual]
+    begin = np.concatenate([_begins(run, length, phase, ends) for run, ends in _unbroken(fixes, length, usual)])
     slack = 1e-3 * usual
     moved = np.concatenate(([0.0], np.cumsum(np.abs(drive.speed[1:]) * np.diff(t))))
     mask, stretches = np.zeros(t.size, dtype=bool), []
@@ -261,6 +262,33 @@ def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -
             mask[a:b] = True
             stretches.append(slice(a, b))
     return (drive.masked(mask, silent), stretches) if stretches else None
+
+
+def _unbroken(fixes: Floats, length: float, usual: float) -> list[tuple[Floats, tuple[float, float]]]:
+    """Divide fixes where the log lacks more than a stretch may lack, and say how much of each side is left alone, s.
+
+    A stretch that ran into a gap would be a longer one.
+    """
+    broken = np.flatnonzero(np.diff(fixes) > max(2.5 * usual, 0.2 * length + usual)) + 1
+    parts = np.split(fixes, broken)
+    beside = max(EDGE, min(BETWEEN, length))
+    return [(run, (beside if k else EDGE, beside if k < broken.size else EDGE)) for k, run in enumerate(parts)]
+
+
+def _room(drive: Grid, length: float) -> float:
+    """Return how many seconds of a drive have fixes."""
+    fixes = drive.t[drive.seen]
+    if fixes.size < _FEWEST_HIDDEN:
+        return 0.0
+    return sum(float(np.ptp(run)) for run, _ in _unbroken(fixes, length, float(np.median(np.diff(fixes)))))
+
+
+def _begins(fixes: Floats, length: float, phase: float, ends: tuple[float, float]) -> Floats:
+    """Return the fixes at which stretches begin, evenly spread."""
+    first, last, period = fixes[0] + ends[0], fixes[-1] - ends[1] - length, _period(length)
+    # where there is room for one only, the phases move it through that
+    even = np.arange(first + phase * min(period, max(last - first, 0.0)), last, period)
+    return np.asarray(fixes[np.searchsorted(fixes, even)])
 
 
 def tested_ends(
@@ -387,7 +415,7 @@ def _asked(
 
 def _independent(n: int, length: float, room: float, each: int) -> float:
     """Return how many independent errors there are in n stretches in so many seconds, some of which may overlap."""
-    return each * n / max(1.0, n * length / room)
+    return each * n / max(1.0, n * length / max(room, length))
 
 
 def factor_for(needed: Sequence[Floats], length: float, level: float, room: float) -> float:

@@ -64,7 +64,7 @@ _STIFF = chain.Chain(rounds=8, tail=np.inf, drifting=False)
 
 #: Rounds in which the chain is solved again with hidden fixes, its scales kept: from the azimuths found with all fixes
 #: or, where a gap has no yaw rate or speed to find them by, from what is known without the hidden ones.
-_AGAIN, _AFRESH = 3, 10
+_AGAIN, _AFRESH = 2, 10
 
 #: Constant velocity bridges a gap that lacks sensors if its error times its half-width is below this share of the
 #: chain's: the nearer path with the narrower interval that holds, as a single one of them may be luck.
