@@ -257,7 +257,7 @@ def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -
         inside = t[a:b][seen[a:b]]
         # a stretch that already lacks fixes is no test, nor is standing still
         whole = inside.size > 0 and inside.size >= 0.8 * length / usual - 1
-        moves = not drive.has_speed or moved[min(b, t.size) - 1] - moved[a] > length
+        moves = not drive.has_speed or moved[min(b, t.size - 1)] - moved[max(a - 1, 0)] > length
         if whole and moves:
             mask[a:b] = True
             stretches.append(slice(a, b))
