@@ -14,9 +14,9 @@ read together: the logarithm of the factor is taken to be
     log factor(s, L) = a + f(log s) + g(log L)
 
 with a Gaussian, f and g Ornstein-Uhlenbeck processes (`_SIZE`, `_BY_SD`, `_BY_LENGTH`), seen in each group with the
-variance of a sample quantile of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n. For n a stretch counts as two in
-each group (its axes; what one place of it is off by, the next one is too), or as one where a sensor is missing; groups
-near each other share their noise, as they come from the same places. That gives the factor for any s and L, and the
+variance of a sample quantile of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n. For n a stretch counts as
+three in each group (errors at one place of it are alike), or as one where a sensor is missing; groups near each other
+share their noise, as they come from the same places. That gives the factor for any s and L, and the
 variance v of its logarithm. A scale known from n independent errors has v = 1 / (2 n), and the interval is then
 Student's: the factor is multiplied by
 t(level, 1 / (2 v)) / z, so that few stretches give a wide interval and not a lucky one. This is an observed frequency
@@ -59,9 +59,10 @@ END_WINDOWS, END_CONTEXT = 16, 30.0
 MOST_NODES = 20_000
 
 #: Errors of one stretch that count as independent: where sensors carry the path through it (two axes, two halves),
-#: those of them in one group, and where what the vehicle did is guessed, so that one wrong guess makes all of the
-#: stretch wrong.
-_PER_STRETCH, _PER_GROUP, _PER_GUESS = 4, 2, 1
+#: those of them in one group (on real logs, by how much the shares inside differ between stretches: from 2 in the group
+#: of the largest standard deviations to 5 in that of the smallest), and where what the vehicle did is guessed, so that
+#: one wrong guess makes all of the stretch wrong.
+_PER_STRETCH, _PER_GROUP, _PER_GUESS = 4, 3, 1
 
 #: Groups of hidden fixes of one length; one where what the vehicle did is guessed.
 GROUPS = 4
