@@ -117,10 +117,10 @@ def test_no_hidden_stretch_runs_into_a_gap_of_the_log(made_grid):
             assert all(end < a - 15 or begin > b + 15 for a, b in ((100, 130), (300, 310)))
             total += 1
     assert total > 10
-    assert calibrate._room(grid, 20.0) == pytest.approx(400 - 31 - 11, abs=1.5)
+    assert sum(np.ptp(run.fixes) for run in calibrate._runs(grid, 20.0)) == pytest.approx(400 - 31 - 11, abs=1.5)
     # a fix that is missing here and there is no gap
     holes = grid.masked(np.random.default_rng(0).uniform(size=len(grid)) < 0.05)
-    assert len(calibrate._hidden(holes, 20.0, 0.0, ())[1]) >= 8
+    assert len(calibrate._hidden(holes, 20.0, 0.0, ())[1]) == 7
 
 
 def test_where_there_is_room_for_one_stretch_the_phases_move_it(made_grid):
@@ -128,4 +128,13 @@ def test_where_there_is_room_for_one_stretch_the_phases_move_it(made_grid):
     begins = [calibrate._hidden(grid, 60.0, phase, ())[1][0].start for phase in (0.0, 0.25, 0.5, 0.75)]
     assert len(set(begins)) == 4
     # which are one place of the log and not four
-    assert calibrate._independent(4, 60.0, calibrate._room(grid, 60.0), 2) == pytest.approx(8 / 2.4)
+    assert calibrate._independent(4, 60.0, np.ptp(calibrate._runs(grid, 60.0)[0].fixes), 2) == pytest.approx(8 / 2.4)
+
+
+def test_between_many_gaps_shorter_stretches_are_hidden(made_grid):
+    grid = made_grid(600.0)
+    grid = grid.masked(grid.t % 50 > 20)  # 20 s of fixes, 30 s without
+    lengths = calibrate.lengths_to_test([grid], np.array([30.0]))
+    assert lengths[-1] == 30.0
+    assert calibrate._hidden(grid, 30.0, 0.0, ()) is None
+    assert len(calibrate._hidden(grid, lengths[0], 0.0, ())[1]) >= 8

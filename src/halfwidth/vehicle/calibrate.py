@@ -16,11 +16,13 @@ read together: the logarithm of the factor is taken to be
 with a Gaussian, f and g Ornstein-Uhlenbeck processes (`_SIZE`, `_BY_SD`, `_BY_LENGTH`), seen in each group with the
 variance of a sample quantile of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n. For n a stretch counts as
 three in each group (errors at one place of it are alike), or as one where a sensor is missing; groups near each other
-share their noise, as they come from the same places. That gives the factor for any s and L, and the
-variance v of its logarithm. A scale known from n independent errors has v = 1 / (2 n), and the interval is then
-Student's: the factor is multiplied by
-t(level, 1 / (2 v)) / z, so that few stretches give a wide interval and not a lucky one. This is an observed frequency
-on this log, no guarantee.
+share their noise, as they come from the same places. That gives the factor for any s and L, and the variance v of its
+logarithm. A scale known from n independent errors has v = 1 / (2 n), and the interval is then Student's: the factor is
+multiplied by t(level, 1 / (2 v)) / z, so that few stretches give a wide interval and not a lucky one. This is an
+observed frequency on this log, no guarantee.
+
+A hidden stretch stands for a gap as long as itself, from fix to fix, with fixes on both sides: none runs into a gap
+that the log has, since that would be a longer one.
 
 A gap in which the speed or the yaw rate is silent as well is another thing than one in which they speak: for such gaps
 they are hidden together with the fixes. What lies beyond the first or the last fix is tested by windows of the log
@@ -166,14 +168,14 @@ def lengths_to_test(drives: Sequence[Grid], gaps: Floats) -> list[float]:
         return []
     shortest, longest = np.clip([gaps.min(), gaps.max()], low, high)
     ratio = max(RATIO, (longest / shortest) ** (1 / (MOST_LENGTHS - 1)))
-    chosen, stretches = [], 0.0
+    chosen, stretches = [], 0
     for k in range(MOST_LENGTHS):
         length = float(longest / ratio**k)
         # shorter ones than any gap only help where there is no room for many of its length
         if length < low * (1 - 1e-9) or (length < shortest * (1 - 1e-9) and stretches >= ENOUGH):
             break
         chosen.append(length)
-        stretches += sum(spans) / _period(length)
+        stretches += sum(run.begins(length, 0.0).size for drive in drives for run in _runs(drive, length))
     return chosen[::-1]
 
 
@@ -221,7 +223,7 @@ def tested(
     every = max(1, round(sum(len(drive) for drive in drives) / MOST_NODES))
     parts = list(enumerate(drives))[::every]
     for length in lengths:
-        room = sum(_room(drive, length) for _, drive in parts)
+        room = sum(float(np.ptp(run.fixes)) for _, drive in parts for run in _runs(drive, length))
         cases: list[_Case] = []
         for phase in range(PHASES):
             if sum(len(case[3]) for case in cases) >= ENOUGH:
@@ -244,12 +246,12 @@ def _enough(found: Sequence[Tested]) -> bool:
 def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -> tuple[Grid, list[slice]] | None:
     """Hide stretches of one length, evenly spread; return the grid and the nodes of each stretch."""
     t, seen = drive.t, drive.seen
-    fixes = t[seen]
-    if fixes.size < _FEWEST_HIDDEN:
+    runs = _runs(drive, length)
+    if not runs:
         return None
-    usual = float(np.median(np.diff(fixes)))
+    usual = float(np.median(np.diff(t[seen])))
     # from one fix to the next that is left it is as long as a gap of this length: the nodes between them are hidden
-    begin = np.concatenate([_begins(run, length, phase, ends) for run, ends in _unbroken(fixes, length, usual)])
+    begin = np.concatenate([run.begins(length, phase) for run in runs])
     slack = 1e-3 * usual
     moved = np.concatenate(([0.0], np.cumsum(np.abs(drive.speed[1:]) * np.diff(t))))
     mask, stretches = np.zeros(t.size, dtype=bool), []
@@ -265,31 +267,35 @@ def _hidden(drive: Grid, length: float, phase: float, silent: tuple[str, ...]) -
     return (drive.masked(mask, silent), stretches) if stretches else None
 
 
-def _unbroken(fixes: Floats, length: float, usual: float) -> list[tuple[Floats, tuple[float, float]]]:
-    """Divide fixes where the log lacks more than a stretch may lack, and say how much of each side is left alone, s.
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """Fixes of which none is missing for long, and how much of each side is left alone, s."""
 
-    A stretch that ran into a gap would be a longer one.
-    """
-    broken = np.flatnonzero(np.diff(fixes) > max(2.5 * usual, 0.2 * length + usual)) + 1
-    parts = np.split(fixes, broken)
-    beside = max(EDGE, min(BETWEEN, length))
-    return [(run, (beside if k else EDGE, beside if k < broken.size else EDGE)) for k, run in enumerate(parts)]
+    fixes: Floats
+    before: float
+    after: float
+
+    def begins(self, length: float, phase: float) -> Floats:
+        """Return the fixes at which stretches begin, evenly spread."""
+        first, last, period = self.fixes[0] + self.before, self.fixes[-1] - self.after - length, _period(length)
+        # where there is room for one only, the phases move it through that
+        even = np.arange(first + phase * min(period, max(last - first, 0.0)), last, period)
+        return np.asarray(self.fixes[np.searchsorted(self.fixes, even)])
 
 
-def _room(drive: Grid, length: float) -> float:
-    """Return how many seconds of a drive have fixes."""
+def _runs(drive: Grid, length: float) -> list[_Run]:
+    """Divide the fixes of a drive where it lacks more of them than a stretch may lack."""
     fixes = drive.t[drive.seen]
     if fixes.size < _FEWEST_HIDDEN:
-        return 0.0
-    return sum(float(np.ptp(run)) for run, _ in _unbroken(fixes, length, float(np.median(np.diff(fixes)))))
-
-
-def _begins(fixes: Floats, length: float, phase: float, ends: tuple[float, float]) -> Floats:
-    """Return the fixes at which stretches begin, evenly spread."""
-    first, last, period = fixes[0] + ends[0], fixes[-1] - ends[1] - length, _period(length)
-    # where there is room for one only, the phases move it through that
-    even = np.arange(first + phase * min(period, max(last - first, 0.0)), last, period)
-    return np.asarray(fixes[np.searchsorted(fixes, even)])
+        return []
+    step = np.diff(fixes)
+    usual = float(np.median(step))
+    broken = np.flatnonzero(step > max(2.5 * usual, 0.2 * length + usual)) + 1
+    beside = max(EDGE, min(BETWEEN, length))
+    return [
+        _Run(run, beside if k else EDGE, beside if k < broken.size else EDGE)
+        for k, run in enumerate(np.split(fixes, broken))
+    ]
 
 
 def tested_ends(
