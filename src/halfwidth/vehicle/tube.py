@@ -92,7 +92,7 @@ def again(drives: Sequence[Grid], paths: Sequence[Path], settings: Tube = Tube()
     """Return the centre of the tube for drives of which fixes were hidden, with what was learnt with all fixes.
 
     The half-widths, the azimuths to linearise about and, within each step of the tube, the shape of the path are those
-    of the paths given; the nodes of the tube are new.
+    of the paths given, and so is the tube itself where fixes are left; elsewhere its nodes are new.
 
     Parameters
     ----------
@@ -116,7 +116,8 @@ def _again(drive: Grid, path: Path, settings: Tube) -> Path:
     kept = _apart(drive.masked(np.isin(drive.t, [t for t, _ in left_out])), settings.step)
     rough = _coarse(drive, kept)
     found = replace(path, azimuth=path.azimuth[kept], info={**path.info, "left_out": left_out})
-    return _centred(drive, path, rough, kept, found, replace(settings, inflation=path.info["inflation"]))
+    half = _DEVIATIONS * np.sqrt(path.variance[kept])
+    return _centred(drive, path, rough, kept, found, replace(settings, inflation=path.info["inflation"]), half)
 
 
 def inflation_of(drive: Grid, settings: Tube = Tube()) -> float:
@@ -176,11 +177,22 @@ def _solved(drive: Grid, settings: Tube) -> Path:
     return _centred(drive, fine, rough, kept, found, settings)
 
 
-def _centred(drive: Grid, fine: Path, rough: Grid, kept: NDArray[np.intp], found: Path, settings: Tube) -> Path:
-    """Return a fine path moved to the centre of the tube of half-widths that were found on some of its nodes."""
+def _centred(
+    drive: Grid,
+    fine: Path,
+    rough: Grid,
+    kept: NDArray[np.intp],
+    found: Path,
+    settings: Tube,
+    known: Floats | None = None,
+) -> Path:
+    """Return a fine path moved to the centre of the tube of half-widths that were found on some of its nodes.
+
+    Where fixes are `known` (n, 2) is half of the tube there, and the path its centre, if given.
+    """
     half_widths = found.info["half_widths"]
     ahead = np.column_stack((fine.east, fine.north))
-    band, inflation = _band(rough, replace(found, east=ahead[kept, 0], north=ahead[kept, 1]), settings)
+    band, inflation = _band(rough, replace(found, east=ahead[kept, 0], north=ahead[kept, 1]), settings, known)
     info = {**found.info, "notes": list(fine.info.get("notes", ())), "inflation": inflation}
     info["left_out"] = tuple(dict.fromkeys((*fine.info.get("left_out", ()), *found.info.get("left_out", ()))))
     if band is None:
@@ -201,10 +213,12 @@ def _centred(drive: Grid, fine: Path, rough: Grid, kept: NDArray[np.intp], found
     return replace(fine, east=moved[0], north=moved[1], variance=variance, fix_variance=fix**2, info=info)
 
 
-def _band(rough: Grid, found: Path, settings: Tube) -> tuple[tuple[Floats, Floats] | None, float]:
+def _band(
+    rough: Grid, found: Path, settings: Tube, known: Floats | None = None
+) -> tuple[tuple[Floats, Floats] | None, float]:
     """Return centre and half-width (n, 2) of the tube, east and north, and the inflation that it took.
 
-    `found` is a path on the nodes of the tube.
+    `found` is a path on the nodes of the tube; where fixes are it is the centre and `known` the half-width, if given.
     """
     half_widths, inflation = found.info["half_widths"], settings.inflation
     model, u, turn = bounded.linearised(rough, found.azimuth, settings.base)
@@ -214,10 +228,10 @@ def _band(rough: Grid, found: Path, settings: Tube) -> tuple[tuple[Floats, Float
     place = np.column_stack((found.east, found.north)) - origin
     y[~rough.seen | np.isin(rough.t, [t for t, _ in found.info.get("left_out", ())])] = np.nan
     assert isinstance(model.w, Uniform)
-    known = model.w.at_most.tolist()
-    step = np.array([half_widths.get(name, most) for name, most in zip(model.names.x, known, strict=True)])
+    most = model.w.at_most.tolist()
+    step = np.array([half_widths.get(name, cap) for name, cap in zip(model.names.x, most, strict=True)])
     grows = np.array([name in half_widths for name in model.names.x])
-    asked = _asked(rough)
+    asked = _asked(rough, fixes=known is None)
     both, axes = np.repeat(asked, 2), np.zeros((2 * asked.size, model.nx))
     axes[:, :2] = turn[asked].reshape(-1, 2)
     for _ in range(_FURTHER):
@@ -231,21 +245,25 @@ def _band(rough: Grid, found: Path, settings: Tube) -> tuple[tuple[Floats, Float
         lo, hi = (np.reshape(side, (-1, 2)) for side in (box.lo, box.hi))
         if not (np.isfinite(lo).all() and np.isfinite(hi).all()):
             break
+        centre, half = 0.5 * (lo + hi), 0.5 * (hi - lo)
+        if known is not None:
+            place[asked], known[asked] = centre, half
+            return (place + origin, known), inflation
         # what is not asked for moves with the path of the chain, and is about as uncertain as its neighbours
-        off = 0.5 * (lo + hi) - place[asked]
-        centre, half = (
+        off, half = (
             np.column_stack([np.interp(rough.t, rough.t[asked], one[:, j]) for j in (0, 1)])
-            for one in (off, 0.5 * (hi - lo))
+            for one in (centre - place[asked], half)
         )
-        return (centre + place + origin, half), inflation
+        return (place + off + origin, half), inflation
     return None, inflation
 
 
-def _asked(rough: Grid) -> NDArray[np.intp]:
-    """Return the nodes that are asked for: those in gaps and around them, and some of the others."""
+def _asked(rough: Grid, *, fixes: bool) -> NDArray[np.intp]:
+    """Return the nodes that are asked for: those in gaps and around them, and, with `fixes`, some of the others."""
     lone = np.concatenate(([False], ~rough.seen, [False]))
     wanted = lone[:-2] | lone[1:-1] | lone[2:]
-    wanted[::_EVERY] = wanted[-1] = True
+    if fixes:
+        wanted[::_EVERY] = wanted[-1] = True
     return np.flatnonzero(wanted)
 
 
