@@ -1,22 +1,26 @@
 """Print how many removed fixes lie in the half-widths that `fill` states, for a user who never saw them.
 
-    python benchmarks/coverage.py [LOGS OR FOLDER ...] [--simulated 8] [--lengths 5,10,20,30,60] [--gaps 40] [--seed 1]
-                                  [--method tube]
+    python benchmarks/coverage.py [LOGS OR FOLDER ...] [--draws 16] [--simulated 16] [--bounded 0] [--method tube]
 
-Fixes are removed at evenly spread places from a random first one on before `fill` sees the log, several gaps at a time if they are far apart; the log is
-then filled as a user would, with its own choice of method and its own test of the half-widths on what is left. The
-removed fixes, east and north counted apart, are inside or not. Gaps drawn at random overlap each other, so the standard
-error beside the share weighs each pair of gaps by how much of them is the same stretch of the log (Bartlett's kernel);
-"apart" says how many gaps of that length the log has room for. The line "all" is over every gap of the log, each
-counting the same. The score is that of Winkler (1972): the whole width, and 2 / (1 - level) times what a fix lies
-beyond it; a lower one is better, and neither wide nor lucky intervals win.
+Fixes are removed at evenly spread places from a random first one on before `fill` sees the log, several gaps at a time
+if they are far apart; the log is then filled as a user would, with its own choice of method and its own test of the
+half-widths on what is left. The removed fixes, east and north counted apart, are inside or not; each gap counts the
+same. The draws of one length begin at as many different places, so that together they go over the whole log.
 
-Simulated drives, with errors of the fixes drawn anew for each, show the same, and beside it how often the *truth* lies
-inside the stated interval, and inside the one that `Track.truth_half_m` states.
+Two standard errors stand beside a share. "draws" is of the share of this log: what more draws could still change of it.
+"roads" is of the share on logs like it: gaps that lie over each other, or close by, are one stretch of one drive, and
+each pair is weighted by how much of them is the same (Bartlett's kernel); "apart" says how many gaps of that length the
+log has room for. In the line "all" each length counts the same. The score is that of Winkler (1972): the whole width,
+and 2 / (1 - level) times what a fix lies beyond it; a lower one is better, and neither wide nor lucky intervals win.
+
+Simulated drives, with errors of the fixes drawn anew for each from centimetres to metres, show the same, and beside it
+how often the *truth* lies inside the stated interval, and inside the one that `Track.truth_half_m` states. The drives
+of ``--bounded`` have speeds, yaw rates and fixes that are wrong by uniform noise and by nothing else.
 """
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import hidden
@@ -30,18 +34,18 @@ from halfwidth.vehicle.outage import MARGIN, MIN_SPEED
 APART = 60.0
 
 
-def places(log, length, rng):
-    """Draw the beginnings of gaps that one run removes: moving, with fixes on both sides, far from each other.
+def places(log, length, share):
+    """Return the beginnings of gaps that one run removes: moving, with fixes on both sides, far from each other.
 
-    They are evenly spread from a random first one on, so that every place of the log is as likely as any other: gaps
-    drawn one by one, each far from those before, crowd at the ends.
+    They are evenly spread from the first one on, which lies a share of the way to the second: every place of the log is
+    then as likely as any other.
     """
     t = log.t[log.fixed]
     east, north = Frame.of(log).to_local(log.lat_deg[log.fixed], log.lon_deg[log.fixed])
     usual = np.median(np.diff(t))
     period = length + max(APART, length)
     chosen = []
-    for begin in np.arange(t[0] + MARGIN + rng.uniform(0, period), t[-1] - MARGIN - length, period):
+    for begin in np.arange(t[0] + MARGIN + share * period, t[-1] - MARGIN - length, period):
         a, b = np.searchsorted(t, [begin, begin + length])
         whole = b - a >= 0.8 * length / usual - 1
         # moved further than the fixes scatter
@@ -53,7 +57,7 @@ def places(log, length, rng):
     return chosen
 
 
-def one_run(log, begins, length, truth=None, drive=0, **how):
+def one_run(log, begins, length, truth=None, draw=0, drive=0, **how):
     """Remove gaps, fill, and return for each the errors and half-widths at the removed fixes, (n, 2) each."""
     track = hw.vehicle.fill(hidden.without(log, begins, length), **how)
     found = []
@@ -61,7 +65,8 @@ def one_run(log, begins, length, truth=None, drive=0, **how):
         off, half, at = hidden.compared(log, track, begin, length)
         if not off.size:
             continue
-        one = {"begin": begin, "length": length, "drive": drive, "off": off, "half": half, "level": track.level}
+        one = {"begin": begin, "length": length, "draw": draw, "drive": drive, "level": track.level}
+        one |= {"off": off, "half": half, "inside": np.mean(np.abs(off) <= half)}
         if truth is not None:
             when = track.t_s[at] - truth.clock_offset  # the track is on the clock of the fixes
             one["true"] = np.column_stack(truth.error_m(when, track.lat_deg[at], track.lon_deg[at]))
@@ -70,53 +75,67 @@ def one_run(log, begins, length, truth=None, drive=0, **how):
     return found
 
 
-def share_and_error(inside, begin, length, drive):
-    """Return the mean share inside and its standard error; gaps of one drive that overlap are not independent."""
-    inside, begin, length, drive = (np.asarray(v) for v in (inside, begin, length, drive))
-    rest = inside - inside.mean()
+def weights(gaps):
+    """Return how much each gap counts: the same as others of its length, and each length the same."""
+    length = np.array([g["length"] for g in gaps])
+    _, which, count = np.unique(length, return_inverse=True, return_counts=True)
+    return 1.0 / (count[which] * count.size)
+
+
+def share_and_errors(gaps):
+    """Return the share inside, its standard error over draws, and over roads."""
+    inside, begin, length, drive, draw = (
+        np.array([g[key] for g in gaps]) for key in ("inside", "begin", "length", "drive", "draw")
+    )
+    weight = weights(gaps)
+    share = weight @ inside
+    rest = weight * (inside - share)
     middle, mean = begin + length / 2, (length[:, None] + length) / 2
     alike = (drive[:, None] == drive) * np.maximum(0.0, 1 - np.abs(middle[:, None] - middle) / (1.5 * mean))
-    return inside.mean(), float(np.sqrt(max(rest @ alike @ rest, 0.0)) / inside.size)
+    roads = np.sqrt(max(rest @ alike @ rest, 0.0))
+    variance = 0.0
+    for one in np.unique(length):
+        mine = length == one
+        rest = weight[mine] * (inside[mine] - inside[mine].mean())
+        # the drives are the draws where each is a drive of its own
+        sums = np.bincount(np.unique(draw[mine] + 1000 * drive[mine], return_inverse=True)[1], rest)
+        variance += np.sum(sums**2) * sums.size / max(sums.size - 1, 1)
+    return share, float(np.sqrt(variance)), float(roads)
 
 
 def row(length, gaps, room, seconds, truths):
     """Print one line of the table; `length` is None for the gaps of all lengths."""
-    level = gaps[0]["level"]
-    inside = [np.mean(np.abs(g["off"]) <= g["half"]) for g in gaps]
-    share, error = share_and_error(inside, *([g[key] for g in gaps] for key in ("begin", "length", "drive")))
-    mean = np.mean([np.hypot(*g["off"].T).mean() for g in gaps])
-    off, half = (np.concatenate([g[key] for g in gaps]).ravel() for key in ("off", "half"))
-    score = np.mean(2 * half + 2 / (1 - level) * np.maximum(np.abs(off) - half, 0))
+    level, weight = gaps[0]["level"], weights(gaps)
+    share, draws, roads = share_and_errors(gaps)
+    mean = weight @ [np.hypot(*g["off"].T).mean() for g in gaps]
+    half = weight @ [g["half"].mean() for g in gaps]
+    beyond = weight @ [np.maximum(np.abs(g["off"]) - g["half"], 0).mean() for g in gaps]
     said = f"{'all':>15}" if length is None else f"{length:>13g} s"
-    text = f"{said}{len(gaps):>6}{room:>7.0f}{mean:>9.2f}{share:>8.3f} +- {error:.3f}"
-    text += f"{np.median(half):>9.2f}{score:>9.2f}{seconds:>8.2f}"
+    text = f"{said}{len(gaps):>6}{room:>7.0f}{mean:>9.2f}{share:>8.3f}{draws:>8.3f}{roads:>7.3f}"
+    text += f"{half:>9.2f}{2 * half + 2 / (1 - level) * beyond:>9.2f}{seconds:>8.2f}"
     if truths:
         for key in ("half", "truth_half"):
-            text += f"{np.mean([np.mean(np.abs(g['true']) <= g[key]) for g in gaps]):>9.3f}"
-        text += f"{np.median(np.concatenate([g['truth_half'] for g in gaps])):>9.2f}"
+            text += f"{weight @ [np.mean(np.abs(g['true']) <= g[key]) for g in gaps]:>9.3f}"
+        text += f"{weight @ [g['truth_half'].mean() for g in gaps]:>9.2f}"
     print(text, flush=True)
 
 
-HEAD = f"{'':15}{'gaps':>6}{'apart':>7}{'mean m':>9}{'inside':>8}    s.e.{'half m':>9}{'score m':>9}{'s':>8}"
+HEAD = f"{'':15}{'gaps':>6}{'apart':>7}{'mean m':>9}{'inside':>8}{'draws':>8}{'roads':>7}{'half m':>9}{'score m':>9}{'s':>8}"
 
 
-def on_log(log, lengths, wanted, seed, **how):
+def on_log(log, lengths, draws, seed, **how):
     """Print the table of one log."""
     print(HEAD)
     every = []
     for length in lengths:
-        rng = np.random.default_rng([seed, round(1000 * length)])
-        gaps, seconds, empty = [], [], 0
-        while len(gaps) < wanted:
-            begins = places(log, length, rng)
-            if not begins:
-                empty += 1
-                if empty == 20:
-                    break
-                continue
-            clock = time.process_time()
-            gaps += one_run(log, begins, length, **how)
-            seconds.append(time.process_time() - clock)
+        first = np.random.default_rng([seed, round(1000 * length)]).uniform()
+        gaps, seconds = [], []
+        for draw in range(draws):
+            begins = places(log, length, (draw + first) / draws)
+            if begins:
+                clock = time.process_time()
+                gaps += one_run(log, begins, length, draw=draw, **how)
+                seconds.append(time.process_time() - clock)
         if gaps:
             row(length, gaps, np.ptp(log.t[log.fixed]) / length, np.median(seconds), False)
             every += gaps
@@ -145,30 +164,66 @@ def drives(count, seed):
         )
 
 
-def on_drives(count, lengths, wanted, seed, **how):
-    """Print the table of simulated drives, each length over all of them."""
+def bounded_drives(count, seed):
+    """Simulate drives whose every error is uniform: fixes, speeds and yaw rates within half-widths of their own."""
+    for k in range(count):
+        rng = np.random.default_rng([seed, k, 1])
+        truth, log = hw.vehicle.simulate_drive(
+            duration=float(rng.uniform(240, 480)),
+            seed=int(rng.integers(1, 2**31)),
+            rate=5.0,
+            tunnels=(),
+            fix_noise=0.0,
+            fix_offset=0.0,
+            speed_scale=float(rng.uniform(0.98, 1.02)),
+            yaw_noise=0.0,
+            yaw_bias=0.0,
+            yaw_drift=0.0,
+        )
+
+        frame, half = Frame.of(log), 10 ** rng.uniform(np.log10([0.05, 0.02, 0.001]), np.log10([3.0, 0.3, 0.02]))
+        east, north, speed, turning = rng.uniform(-1, 1, (4, len(log))) * half[[0, 0, 1, 2], None]
+        there = frame.to_local(log.lat_deg, log.lon_deg)
+        lat, lon = frame.to_geodetic(there[0] + east, there[1] + north)
+        yield (
+            truth,
+            replace(
+                log,
+                lat_deg=lat,
+                lon_deg=lon,
+                speed_mps=log.speed_mps + speed,
+                yaw_rate_radps=log.yaw_rate_radps + rng.uniform(-0.01, 0.01) + turning,
+            ),
+        )
+
+
+def on_drives(made, lengths, seed, **how):
+    """Print the table of simulated drives: one draw of each length on each of them."""
     print(HEAD + f"{'truth':>9}{'in t.h.':>9}{'t.h. m':>9}")
-    made, every = list(drives(count, seed)), []
+    every = []
     for length in lengths:
         gaps, seconds, room = [], [], 0.0
         for k, (truth, log) in enumerate(made):
-            rng = np.random.default_rng([seed, k, round(1000 * length)])
-            begins = rng.permutation(places(log, length, rng))[: max(1, round(wanted / count))].tolist()
+            share = np.random.default_rng([seed, k, round(1000 * length)]).uniform()
+            begins = places(log, length, share)
             clock = time.process_time()
-            gaps += one_run(log, begins, length, truth, k, **how) if begins else []
+            gaps += one_run(log, begins, length, truth, 0, k, **how) if begins else []
             seconds.append(time.process_time() - clock)
             room += np.ptp(log.t) / length
-        row(length, gaps, room, np.median(seconds), True)
-        every += gaps
-    row(None, every, np.nan, np.nan, True)
+        if gaps:
+            row(length, gaps, room, np.median(seconds), True)
+            every += gaps
+    if every:
+        row(None, every, np.nan, np.nan, True)
 
 
 def main():
     root = Path(__file__).resolve().parents[1]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="*", type=Path)
-    parser.add_argument("--simulated", type=int, default=8, help="how many drives are simulated")
-    parser.add_argument("--gaps", type=int, default=40, help="gaps of each length")
+    parser.add_argument("--draws", type=int, default=16, help="times that each length is drawn on each log")
+    parser.add_argument("--simulated", type=int, default=16, help="how many drives are simulated")
+    parser.add_argument("--bounded", type=int, default=0, help="how many drives with bounded noise are simulated")
     parser.add_argument("--lengths", default="5,10,20,30,60")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--method", help="of `fill`, instead of its own choice")
@@ -177,12 +232,16 @@ def main():
     folder = root.parent / "shared" / "data"
     given = asked.logs or ([folder] if folder.exists() else [])
     logs = [path for one in given for path in (sorted(one.glob("*.csv*")) if one.is_dir() else [one])]
-    for path in logs:
+    for path in logs if asked.draws else ():
         print(f"\n=== {path.name}")
-        on_log(hw.vehicle.read(path), lengths, asked.gaps, asked.seed, method=asked.method)
-    if asked.simulated:
-        print(f"\n=== {asked.simulated} simulated drives")
-        on_drives(asked.simulated, lengths, asked.gaps, asked.seed, method=asked.method)
+        on_log(hw.vehicle.read(path), lengths, asked.draws, asked.seed, method=asked.method)
+    for count, kind, made in (
+        (asked.simulated, "simulated drives", drives),
+        (asked.bounded, "drives with bounded noise", bounded_drives),
+    ):
+        if count:
+            print(f"\n=== {count} {kind}")
+            on_drives(list(made(count, asked.seed)), lengths, asked.seed, method=asked.method)
 
 
 if __name__ == "__main__":

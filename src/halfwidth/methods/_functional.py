@@ -38,3 +38,11 @@ def functional_of(c: ArrayLike, nx: int) -> Array:
     if row.shape != (nx,):
         raise BadShape(f"`c` has shape {row.shape}, ({nx},) was expected from the model")
     return row
+
+
+def functionals_of(c: ArrayLike, n: int, nx: int) -> Array:
+    """Judge n functionals (n, nx)."""
+    rows = real(c, "c")
+    if rows.shape != (n, nx):
+        raise BadShape(f"`c` has shape {rows.shape}, ({nx},) or ({n}, {nx}) was expected from the model and the rows")
+    return rows

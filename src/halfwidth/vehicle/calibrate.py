@@ -14,12 +14,15 @@ read together: the logarithm of the factor is taken to be
     log factor(s, L) = a + f(log s) + g(log L)
 
 with a Gaussian, f and g Ornstein-Uhlenbeck processes (`_SIZE`, `_BY_SD`, `_BY_LENGTH`), seen in each group with the
-variance of a sample quantile of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n. For n a stretch counts as four (two
-axes, two halves), or as one where a sensor is missing; groups near each other share their noise, as they come from the
-same places. That gives the factor for any s and L, and the variance v of its logarithm. A scale known from n
-independent errors has v = 1 / (2 n), and the interval is then Student's: the factor is multiplied by
-t(level, 1 / (2 v)) / z, so that few stretches give a wide interval and not a lucky one. This is an observed frequency
-on this log, no guarantee.
+variance of a sample quantile of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n. For n a stretch counts as
+three in each group (errors at one place of it are alike), or as one where a sensor is missing; groups near each other
+share their noise, as they come from the same places. That gives the factor for any s and L, and the variance v of its
+logarithm. A scale known from n independent errors has v = 1 / (2 n), and the interval is then Student's: the factor is
+multiplied by t(level, 1 / (2 v)) / z, so that few stretches give a wide interval and not a lucky one. This is an
+observed frequency on this log, no guarantee.
+
+A hidden stretch stands for a gap as long as itself, from fix to fix, with fixes on both sides: none runs into a gap
+that the log has, since that would be a longer one.
 
 A gap in which the speed or the yaw rate is silent as well is another thing than one in which they speak: for such gaps
 they are hidden together with the fixes. What lies beyond the first or the last fix is tested by windows of the log
@@ -40,7 +43,7 @@ Floats = NDArray[np.float64]
 
 #: Lengths at most at which the log is tested, each this many times the next; shifted repetitions of each test at most,
 #: and stretches that are enough without another one.
-MOST_LENGTHS, RATIO, PHASES, ENOUGH = 5, 2.0, 3, 40
+MOST_LENGTHS, RATIO, PHASES, ENOUGH = 5, 2.0, 5, 40
 
 #: Fixes that a log needs for a test.
 FEWEST_FIXES = 16
@@ -48,15 +51,20 @@ FEWEST_FIXES = 16
 #: Fixes left between hidden stretches and at the ends, s, at least; and stretches of one length that are a test.
 BETWEEN, EDGE, FEWEST = 15.0, 3.0, 3
 
+#: Fixes of a drive without which nothing of it is hidden.
+_FEWEST_HIDDEN = 5
+
 #: Windows cut out of a log to test how far off a path gets beyond the last fix, about, and their fixes, s.
 END_WINDOWS, END_CONTEXT = 16, 30.0
 
 #: Nodes of the parts of a log that are tested, about.
 MOST_NODES = 20_000
 
-#: Errors of one stretch that count as independent: where sensors carry the path through it, and where what the
-#: vehicle did is guessed, so that one wrong guess makes all of the stretch wrong.
-_PER_STRETCH, _PER_GUESS = 4, 1
+#: Errors of one stretch that count as independent: where sensors carry the path through it (two axes, two halves),
+#: those of them in one group (on real logs, by how much the shares inside differ between stretches: from 2 in the group
+#: of the largest standard deviations to 5 in that of the smallest), and where what the vehicle did is guessed, so that
+#: one wrong guess makes all of the stretch wrong.
+_PER_STRETCH, _PER_GROUP, _PER_GUESS = 4, 3, 1
 
 #: Groups of hidden fixes of one length; one where what the vehicle did is guessed.
 GROUPS = 4
@@ -163,14 +171,14 @@ def lengths_to_test(drives: Sequence[Grid], gaps: Floats) -> list[float]:
         return []
     shortest, longest = np.clip([gaps.min(), gaps.max()], low, high)
     ratio = max(RATIO, (longest / shortest) ** (1 / (MOST_LENGTHS - 1)))
-    chosen, stretches = [], 0.0
+    chosen, stretches = [], 0
     for k in range(MOST_LENGTHS):
         length = float(longest / ratio**k)
         # shorter ones than any gap only help where there is no room for many of its length
         if length < low * (1 - 1e-9) or (length < shortest * (1 - 1e-9) and stretches >= ENOUGH):
             break
         chosen.append(length)
-        stretches += sum(spans) / _period(length)
+        stretches += sum(run.begins(length, 0.0).size for drive in drives for run in _runs(drive, length))
     return chosen[::-1]
 
 
@@ -220,8 +228,8 @@ def tested(
     # a long log is tested on parts of it, evenly spread
     every = max(1, round(sum(len(drive) for drive in drives) / MOST_NODES))
     parts = list(enumerate(drives))[::every]
-    room = sum(float(np.ptp(drive.t[drive.seen])) for _, drive in parts if drive.seen.any())
     for length in lengths:
+        room = sum(float(np.ptp(run.fixes)) for _, drive in parts for run in _runs(drive, length))
         cases: list[_Case] = []
         for phase in range(PHASES):
             if sum(len(case[3]) for case in cases) >= ENOUGH:
@@ -231,7 +239,7 @@ def tested(
         if not cases:
             continue
         for by, paths in rerun([case[0] for case in cases], [case[2] for case in cases]).items():
-            one = _judged(cases, paths, length, level, z, _PER_GUESS if guessed else _PER_STRETCH, room)
+            one = _judged(cases, paths, length, level, z, _PER_GUESS if guessed else _PER_GROUP, room)
             if one is not None:
                 by_way.setdefault(by, []).append(replace(one, silent=silent, by=by, guessed=guessed, part=part))
     return {by: _sized(found, level) for by, found in by_way.items() if _enough(found)}
@@ -246,20 +254,21 @@ def _hidden(
 ) -> tuple[Grid, list[slice]] | None:
     """Hide stretches of one length, evenly spread; return the grid and the nodes of each stretch."""
     t, seen = drive.t, drive.seen
-    fixes = t[seen]
-    if fixes.size < 5:
+    runs = _runs(drive, length)
+    if not runs:
         return None
-    period = _period(length)
-    begin = np.arange(fixes[0] + EDGE + phase * period, fixes[-1] - EDGE - length, period)
-    usual = float(np.median(np.diff(fixes)))
+    usual = float(np.median(np.diff(t[seen])))
+    # from one fix to the next that is left it is as long as a gap of this length: the nodes between them are hidden
+    begin = np.concatenate([run.begins(length, phase) for run in runs])
+    slack = 1e-3 * usual
     moved = np.concatenate(([0.0], np.cumsum(np.abs(drive.speed[1:]) * np.diff(t))))
     mask, stretches = np.zeros(t.size, dtype=bool), []
     for t0 in begin:
-        a, b = int(np.searchsorted(t, t0)), int(np.searchsorted(t, t0 + length, side="right"))
+        a, b = int(np.searchsorted(t, t0 + slack)), int(np.searchsorted(t, t0 + length - slack))
         inside = t[a:b][seen[a:b]]
         # a stretch that already lacks fixes is no test, nor is standing still
         whole = inside.size > 0 and inside.size >= 0.8 * length / usual - 1
-        moves = not drive.has_speed or moved[min(b, t.size) - 1] - moved[a] > length
+        moves = not drive.has_speed or moved[min(b, t.size - 1)] - moved[max(a - 1, 0)] > length
         if whole and moves:
             mask[a:b] = True
             stretches.append(slice(a, b))
@@ -270,6 +279,37 @@ def _hidden(
         share = (t[own] - t[own][0]) / max(length, 1e-9)
         lost[own] = (share >= part[0] - 1e-9) & (share <= part[1] + 1e-9)
     return drive.masked(lost, silent).masked(mask), stretches
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """Fixes of which none is missing for long, and how much of each side is left alone, s."""
+
+    fixes: Floats
+    before: float
+    after: float
+
+    def begins(self, length: float, phase: float) -> Floats:
+        """Return the fixes at which stretches begin, evenly spread."""
+        first, last, period = self.fixes[0] + self.before, self.fixes[-1] - self.after - length, _period(length)
+        # where there is room for one only, the phases move it through that
+        even = np.arange(first + phase * min(period, max(last - first, 0.0)), last, period)
+        return np.asarray(self.fixes[np.searchsorted(self.fixes, even)])
+
+
+def _runs(drive: Grid, length: float) -> list[_Run]:
+    """Divide the fixes of a drive where it lacks more of them than a stretch may lack."""
+    fixes = drive.t[drive.seen]
+    if fixes.size < _FEWEST_HIDDEN:
+        return []
+    step = np.diff(fixes)
+    usual = float(np.median(step))
+    broken = np.flatnonzero(step > max(2.5 * usual, 0.2 * length + usual)) + 1
+    beside = max(EDGE, min(BETWEEN, length))
+    return [
+        _Run(run, beside if k else EDGE, beside if k < broken.size else EDGE)
+        for k, run in enumerate(np.split(fixes, broken))
+    ]
 
 
 def tested_ends(
@@ -365,7 +405,7 @@ def _judged(
     n = len(factors)
     if n == 0:
         return None
-    errors = _independent(n, length, room, independent)
+    groups = GROUPS if independent == _PER_GROUP else 1
     return Tested(
         length,
         n,
@@ -374,7 +414,7 @@ def _judged(
         float(np.mean(inside)),
         1.0,
         half_m=float(np.mean(halves)),
-        asked=_asked(factors, sds, level, errors, GROUPS if independent == _PER_STRETCH else 1),
+        asked=_asked(factors, sds, level, _independent(n, length, room, independent), groups),
     )
 
 
@@ -396,7 +436,7 @@ def _asked(
 
 def _independent(n: int, length: float, room: float, each: int) -> float:
     """Return how many independent errors there are in n stretches in so many seconds, some of which may overlap."""
-    return each * n / max(1.0, n * length / room)
+    return each * n / max(1.0, n * length / max(room, length))
 
 
 def factor_for(needed: Sequence[Floats], length: float, level: float, room: float) -> float:

@@ -26,7 +26,7 @@ _STIFF = chain.Chain(rounds=8, tail=np.inf, drifting=False)
 
 #: Rounds in which the chain is solved again with hidden fixes, its scales kept: from the azimuths found with all fixes
 #: or, where a gap has no yaw rate or speed to find them by, from what is known without the hidden ones.
-_AGAIN, _AFRESH = 3, 10
+_AGAIN, _AFRESH = 2, 10
 
 #: Names of what the chain finds, as the settings of a track have them.
 _WORDS = {"speed_scale": "speed scale", "yaw_bias": "yaw bias", "slow_sd": "slow error of the fixes"}

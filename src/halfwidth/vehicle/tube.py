@@ -2,14 +2,15 @@
 
 The half-widths of the bounded chain (`halfwidth.vehicle.bounded`: along and across the way, yaw rate, fix; scale and
 bias within their bounds) are learnt by linear programming, and are the smallest that explain the drive. They are
-inflated by a factor that hiding stretches of the same log has shown (`inflation_of`), and `halfwidth.Hull` gives the
-box that every state must lie in with them, from all fixes on both sides. Its middle is the path, its half-width the
-band. The band is as good as learnt half-widths are: it is no guarantee, and `fill` sizes it like any other. What is
-declared instead of learnt is in `halfwidth.vehicle.proven`.
+inflated by a factor that hiding stretches of the same log has shown (`inflation_of`), and `halfwidth.bound` gives the
+box, east and north, that the position must lie in with them, from the fixes on both sides. Its middle is the path, its
+half-width the band. The band is as good as learnt half-widths are: it is no guarantee, and `fill` sizes it like any
+other. What is declared instead of learnt is in `halfwidth.vehicle.proven`.
 
 A set knows no averages, so neighbouring fixes tell it little that is new: it is computed on nodes about a second
-apart, whose speed is that of the chord between them, and carried to the nodes of the drive along the path of the
-bounded chain in its elastic form, which also leaves out fixes that nothing explains.
+apart, whose speed is that of the chord between them, asked for at all of these in gaps and at every third elsewhere,
+and carried to the nodes of the drive along the path of the bounded chain in its elastic form, which also leaves out
+fixes that nothing explains.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth.methods import load
+from halfwidth.bound import bound
+from halfwidth.errors import Unsolved
 from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.result import Status
@@ -40,6 +42,9 @@ _STRETCHES, _HIDDEN, _CONTEXT = 8, 15.0, 20.0
 
 #: Share of the worst rows whose mean counts where fixes are screened.
 _ELASTIC = 0.1
+
+#: Nodes with a fix that count on each side of a node; of nodes with fixes on both sides every so many is asked for.
+_NEAR, _EVERY = 20, 3
 
 #: Times that a tube without any path is inflated further, and by how much.
 _FURTHER, _MORE = 3, 1.5
@@ -87,7 +92,7 @@ def again(drives: Sequence[Grid], paths: Sequence[Path], settings: Tube = Tube()
     """Return the centre of the tube for drives of which fixes were hidden, with what was learnt with all fixes.
 
     The half-widths, the azimuths to linearise about and, within each step of the tube, the shape of the path are those
-    of the paths given; the nodes of the tube are new.
+    of the paths given, and so is the tube itself where fixes are left; elsewhere its nodes are new.
 
     Parameters
     ----------
@@ -111,7 +116,8 @@ def _again(drive: Grid, path: Path, settings: Tube) -> Path:
     kept = _apart(drive.masked(np.isin(drive.t, [t for t, _ in left_out])), settings.step)
     rough = _coarse(drive, kept)
     found = replace(path, azimuth=path.azimuth[kept], info={**path.info, "left_out": left_out})
-    return _centred(drive, path, rough, kept, found, replace(settings, inflation=path.info["inflation"]))
+    half = _DEVIATIONS * np.sqrt(path.variance[kept])
+    return _centred(drive, path, rough, kept, found, replace(settings, inflation=path.info["inflation"]), half)
 
 
 def inflation_of(drive: Grid, settings: Tube = Tube()) -> float:
@@ -171,10 +177,22 @@ def _solved(drive: Grid, settings: Tube) -> Path:
     return _centred(drive, fine, rough, kept, found, settings)
 
 
-def _centred(drive: Grid, fine: Path, rough: Grid, kept: NDArray[np.intp], found: Path, settings: Tube) -> Path:
-    """Return a fine path moved to the centre of the tube of half-widths that were found on some of its nodes."""
+def _centred(
+    drive: Grid,
+    fine: Path,
+    rough: Grid,
+    kept: NDArray[np.intp],
+    found: Path,
+    settings: Tube,
+    known: Floats | None = None,
+) -> Path:
+    """Return a fine path moved to the centre of the tube of half-widths that were found on some of its nodes.
+
+    Where fixes are `known` (n, 2) is half of the tube there, and the path its centre, if given.
+    """
     half_widths = found.info["half_widths"]
-    band, inflation = _band(rough, found, settings)
+    ahead = np.column_stack((fine.east, fine.north))
+    band, inflation = _band(rough, replace(found, east=ahead[kept, 0], north=ahead[kept, 1]), settings, known)
     info = {**found.info, "notes": list(fine.info.get("notes", ())), "inflation": inflation}
     info["left_out"] = tuple(dict.fromkeys((*fine.info.get("left_out", ()), *found.info.get("left_out", ()))))
     if band is None:
@@ -182,7 +200,6 @@ def _centred(drive: Grid, fine: Path, rough: Grid, kept: NDArray[np.intp], found
         return replace(fine, status=Status.REDUCED, info={**info, "notes": [*info["notes"], words]})
     centre, half = band
     # the fine path moved by what the tube's centre is off it at the nodes of the tube
-    ahead = np.column_stack((fine.east, fine.north))
     t, at = drive.t, rough.t
     moved = [ahead[:, j] + np.interp(t, at, centre[:, j] - ahead[kept, j]) for j in (0, 1)]
     spread = np.column_stack([np.interp(t, at, half[:, j]) for j in (0, 1)])
@@ -196,29 +213,58 @@ def _centred(drive: Grid, fine: Path, rough: Grid, kept: NDArray[np.intp], found
     return replace(fine, east=moved[0], north=moved[1], variance=variance, fix_variance=fix**2, info=info)
 
 
-def _band(rough: Grid, found: Path, settings: Tube) -> tuple[tuple[Floats, Floats] | None, float]:
-    """Return centre and half-width (n, 2) of the tube, east and north, and the inflation that it took."""
+def _band(
+    rough: Grid, found: Path, settings: Tube, known: Floats | None = None
+) -> tuple[tuple[Floats, Floats] | None, float]:
+    """Return centre and half-width (n, 2) of the tube, east and north, and the inflation that it took.
+
+    `found` is a path on the nodes of the tube; where fixes are it is the centre and `known` the half-width, if given.
+    """
     half_widths, inflation = found.info["half_widths"], settings.inflation
     model, u, turn = bounded.linearised(rough, found.azimuth, settings.base)
     y = np.column_stack((rough.east, rough.north))
     origin = y[int(np.argmax(rough.seen))].copy()
     y = y - origin
+    place = np.column_stack((found.east, found.north)) - origin
     y[~rough.seen | np.isin(rough.t, [t for t, _ in found.info.get("left_out", ())])] = np.nan
     assert isinstance(model.w, Uniform)
-    known = model.w.at_most.tolist()
-    step = np.array([half_widths.get(name, most) for name, most in zip(model.names.x, known, strict=True)])
+    most = model.w.at_most.tolist()
+    step = np.array([half_widths.get(name, cap) for name, cap in zip(model.names.x, most, strict=True)])
     grows = np.array([name in half_widths for name in model.names.x])
+    asked = _asked(rough, fixes=known is None)
+    both, axes = np.repeat(asked, 2), np.zeros((2 * asked.size, model.nx))
+    axes[:, :2] = turn[asked].reshape(-1, 2)
     for _ in range(_FURTHER):
         w = Uniform(step * np.where(grows, inflation, 1.0))
         e = Uniform(np.full(2, half_widths["fix"] * inflation))
-        est = load("Hull")().run(replace(model, w=w, e=e), Record(rough.t, y, u))
-        if est.status.good:
-            lo, hi = est.interval()
-            if np.isfinite(lo[:, :2]).all() and np.isfinite(hi[:, :2]).all():
-                centre = np.einsum("kij,kj->ki", turn, 0.5 * (lo + hi)[:, :2]) + origin
-                return (centre, np.einsum("kij,kj->ki", np.abs(turn), 0.5 * (hi - lo)[:, :2])), inflation
-        inflation *= _MORE
+        try:
+            box = bound(replace(model, w=w, e=e), Record(rough.t, y, u), axes, at=both, reach=_NEAR)
+        except Unsolved:  # no path fits
+            inflation *= _MORE
+            continue
+        lo, hi = (np.reshape(side, (-1, 2)) for side in (box.lo, box.hi))
+        if not (np.isfinite(lo).all() and np.isfinite(hi).all()):
+            break
+        centre, half = 0.5 * (lo + hi), 0.5 * (hi - lo)
+        if known is not None:
+            place[asked], known[asked] = centre, half
+            return (place + origin, known), inflation
+        # what is not asked for moves with the path of the chain, and is about as uncertain as its neighbours
+        off, half = (
+            np.column_stack([np.interp(rough.t, rough.t[asked], one[:, j]) for j in (0, 1)])
+            for one in (centre - place[asked], half)
+        )
+        return (place + off + origin, half), inflation
     return None, inflation
+
+
+def _asked(rough: Grid, *, fixes: bool) -> NDArray[np.intp]:
+    """Return the nodes that are asked for: those in gaps and around them, and, with `fixes`, some of the others."""
+    lone = np.concatenate(([False], ~rough.seen, [False]))
+    wanted = lone[:-2] | lone[1:-1] | lone[2:]
+    if fixes:
+        wanted[::_EVERY] = wanted[-1] = True
+    return np.flatnonzero(wanted)
 
 
 def _apart(drive: Grid, step: float) -> NDArray[np.intp]:
