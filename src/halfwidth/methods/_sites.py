@@ -164,7 +164,7 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
     scale = scales(effect, [record.y[record.seen[:, j], j] for j in range(model.ny)])
     if frame is None or not frame.fits(scale, y):
         frame = _frame(model, record, scale, outliers)
-        if frames is not None and kept and _constant(model):
+        if frames is not None and kept and _constant(model) and frame.fits(scale, y):
             if len(frames) >= _FRAMES:
                 del frames[next(iter(frames))]
             frames[kept] = frame
