@@ -476,14 +476,14 @@ def robust():
 
 
 #: Middle of the half-widths' prior in calibration, and its standard deviation over the middle, both of s^(1/2).
-MIDDLE, SPREAD = np.sqrt([0.1, 0.1, 0.1, 0.3, 0.3]), 0.25
+MIDDLE, SPREAD = np.array([0.1, 0.1, 0.1, 0.3, 0.3]), 0.3
 
 
 def from_the_prior(rng):
-    """Return half-widths (5,) whose u = s^(1/2) has the density u^(2 power - 1) exp(-(u / middle - 1)^2 / 2 spread^2)."""
-    v = np.linspace(1e-4, 1.0 + 8 * SPREAD, 20_000)
-    below = np.cumsum(v ** (2 * posterior.POWER - 1) * np.exp(-0.5 * ((v - 1.0) / SPREAD) ** 2))
-    return (MIDDLE * np.interp(rng.random(5), below / below[-1], v)) ** 2
+    """Return half-widths (5,) of the density s^(power - 1) exp(-(s / middle - 1)^2 / 2 spread^2)."""
+    v = np.geomspace(1e-6, 1.0 + 8 * SPREAD, 20_000)
+    below = np.cumsum(v**posterior.POWER * np.exp(-0.5 * ((v - 1.0) / SPREAD) ** 2))
+    return MIDDLE * np.interp(rng.random(5), below / below[-1], v)
 
 
 def rank_of_s(found, s):
@@ -506,14 +506,14 @@ def rank_of_s(found, s):
 def sbc(*, reference, delta=25, seed=5):
     """Return estimates, true states, and ranks of true half-widths (windows, 5) under the prior that they are drawn from.
 
-    It is a power of s, as the default prior is, times a Gaussian of s^(1/2), as other rows of a stream would tell it.
+    It is a power of s, as the default prior is, times a Gaussian of s, as other rows of a stream would tell it.
     `reference`: whether the estimates have the default prior's factor `told` besides, which nothing can be drawn from.
     """
     rng = np.random.default_rng(seed)
     x0 = hw.Box(0.3 * BOX.lo, 0.3 * BOX.hi)
     unknown = hw.Uniform.unknown(at_most=50.0)
     asked = system(unknown, unknown, x0, bounds=None)
-    known = Known(1.0 / (MIDDLE * SPREAD**2), np.diag(1.0 / (MIDDLE * SPREAD) ** 2))
+    known = Known(1.0 / (MIDDLE * SPREAD**2), np.diag(1.0 / (MIDDLE * SPREAD) ** 2), np.zeros(5))
     kept = posterior._LIMITS["reference"]
     posterior._LIMITS["reference"] = kept if reference else 0.0
     ests, true, of_s = [], [], []

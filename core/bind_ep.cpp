@@ -230,7 +230,7 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
 nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale, In start, In count,
                InBool squared, bool learn_eps, double rate, double start_eps, double power, double beta_a, double beta_b, In z,
                const nb::dict& limits, std::optional<nb::tuple> before, int drop, int shaped, std::optional<In> pull,
-               std::optional<In> precision, std::optional<nb::dict> outside) {
+               std::optional<In> precision, std::optional<In> known_power, std::optional<nb::dict> outside) {
     want(z.ndim() == 2 && z.shape(0) >= 1, "z (nodes, q)");
     const std::size_t nodes = z.shape(0), abreast = (nodes + hw::ep_abreast - 1) / hw::ep_abreast * hw::ep_abreast;
     Problem p(problem, abreast);
@@ -252,11 +252,14 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     l.scale = scale.data();
     l.start = start.data();
     l.count = count.data();
-    want(pull.has_value() == precision.has_value(), "pull and precision go together");
+    want(pull.has_value() == precision.has_value() && pull.has_value() == known_power.has_value(),
+         "pull, precision and known_power go together");
     if (pull) {
-        want(pull->size() == groups && precision->size() == groups * groups, "pull (groups,), precision (groups,groups)");
+        want(pull->size() == groups && precision->size() == groups * groups && known_power->size() == groups,
+             "pull (groups,), precision (groups,groups), known_power (groups,)");
         l.pull = pull->data();
         l.precision = precision->data();
+        l.known_power = known_power->data();
     }
     l.learn_eps = learn_eps;
     l.rate = rate;
@@ -372,6 +375,7 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
             for (double* v : {l.mean, l.quantile_lo, l.quantile_hi}) v[g] *= v[g];
     found["told_pull"] = fresh({groups}, &l.told_pull);
     found["told_precision"] = fresh({groups, groups}, &l.told_precision);
+    found["told_power"] = fresh({groups}, &l.told_power);
     found["edge_x"] = fresh({stages, n}, &l.edge_x);
     found["edge_P"] = fresh({stages, n, n}, &l.edge_P);
     double found_rate = 0.0, effective = 0.0;
@@ -409,14 +413,15 @@ nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale,
     return found;
 }
 
-nb::tuple known(InBool free, In pull, In precision) {
+nb::tuple known(InBool free, In start, In pull, In precision, In power) {
     const std::size_t p = free.size();
-    want(pull.size() == p && precision.size() == p * p, "pull (p,), precision (p,p)");
-    double *h = nullptr, *H = nullptr;
-    nb::object found_h = fresh({p}, &h), found_H = fresh({p, p}, &H);
-    Work work(4 * p * (p + 1));
-    HW_PICK_WIDE(ep_known_part)(static_cast<int>(p), free.data(), pull.data(), precision.data(), h, H, work.p);
-    return nb::make_tuple(found_h, found_H);
+    want(start.size() == p && pull.size() == p && precision.size() == p * p && power.size() == p,
+         "start, pull, power (p,), precision (p,p)");
+    double *h = nullptr, *H = nullptr, *g = nullptr;
+    nb::object found_h = fresh({p}, &h), found_H = fresh({p, p}, &H), found_g = fresh({p}, &g);
+    Work work(5 * p * (p + 1));
+    HW_PICK_WIDE(ep_known_part)(static_cast<int>(p), free.data(), start.data(), pull.data(), precision.data(), power.data(), h, H, g, work.p);
+    return nb::make_tuple(found_h, found_H, found_g);
 }
 
 }  // namespace
@@ -424,12 +429,12 @@ nb::tuple known(InBool free, In pull, In precision) {
 void bind_ep(nb::module_& mod) {
     mod.def("ep_run", &run, "problem"_a, "s"_a, "eps"_a, "sweeps"_a, "tol"_a, "damping"_a, "sites"_a.none(),
             "Expectation propagation on a chain for given half-widths, one set a member; see core/ep_entry.hpp.");
-    mod.def("ep_known", &known, "free"_a, "pull"_a, "precision"_a,
+    mod.def("ep_known", &known, "free"_a, "start"_a, "pull"_a, "precision"_a, "power"_a,
             "What is known of the free half-widths alone, whatever the others are; see core/ep_handover.hpp.");
     mod.def("ep_learn", &learn, "problem"_a, "free"_a, "floor"_a, "cap"_a, "scale"_a, "start"_a, "count"_a,
             "squared"_a, "learn_eps"_a,
             "rate"_a, "start_eps"_a, "power"_a, "beta_a"_a, "beta_b"_a, "z"_a, "limits"_a,
             "before"_a.none() = nb::none(), "drop"_a = 0, "shaped"_a = 0, "pull"_a.none() = nb::none(), "precision"_a.none() = nb::none(),
-            "outside"_a.none() = nb::none(),
+            "known_power"_a.none() = nb::none(), "outside"_a.none() = nb::none(),
             "The same with half-widths found by evidence and what is not known of them carried into the answer.");
 }

@@ -181,7 +181,7 @@ int learn_any(const EpLearnArgs& a) {
 // numbers that taking over and handing on need, in whole registers
 std::size_t handover_size(const EpLearnArgs& a) {
     const std::size_t p = a.base.groups, n = a.base.n;
-    const std::size_t size = 5 * p * (p + 1) + a.nodes * (2 * learner_parameters(a) + 2) + 4 * n * n + 2 * n;
+    const std::size_t size = 6 * p * (p + 1) + p + a.nodes * (2 * learner_parameters(a) + 2) + 4 * n * n + 2 * n;
     return (size + wide_lanes - 1) / wide_lanes * wide_lanes;
 }
 
@@ -193,9 +193,9 @@ std::size_t ep_learn_workspace(const EpLearnArgs& a) {
     return a.outside ? own + wide_lanes + ep_workspace(*a.outside) : own;
 }
 
-void ep_known_part(int p, const bool* free, const double* pull, const double* precision, double* found_pull,
-                   double* found_precision, double* work) {
-    ep_known(p, free, pull, precision, found_pull, found_precision, work);
+void ep_known_part(int p, const bool* free, const double* start, const double* pull, const double* precision, const double* power,
+                   double* found_pull, double* found_precision, double* found_power, double* work) {
+    ep_taken(p, free, start, pull, precision, power, found_pull, found_precision, found_power, work);
 }
 
 int ep_learn(const EpLearnArgs& given) {
@@ -206,10 +206,11 @@ int ep_learn(const EpLearnArgs& given) {
     const int p = a.base.groups;
     double* rest = work;
     if (a.pull) {
-        rest = work + p * (p + 1);
-        ep_known(p, a.free, given.pull, given.precision, work, work + p, rest);
+        rest = work + p * (p + 2);
+        ep_taken(p, a.free, a.start, given.pull, given.precision, given.known_power, work, work + p, work + p * (p + 1), rest);
         a.pull = work;
         a.precision = work + p;
+        a.known_power = work + p * (p + 1);
     }
     EpBefore before{};
     a.before = nullptr;

@@ -91,7 +91,7 @@ struct EpLearnArgs {
     double rate, start_eps;                  // the rate where it is known; logit of the first guess
     double power, reference, warp;           // prior of log s: s^power told^reference; nodes are Gaussian in s^warp
     double beta_a, beta_b;                   // prior of the rate
-    const double *pull, *precision;          // (groups,), (groups,groups): what is known already, in u = s^warp; or null
+    const double *pull, *precision, *known_power;  // (groups,), (groups,groups), (groups,): what is known already of s; or null
     int steps, few, many, most;              // Newton steps; sweeps of a step, of the first one, of a node
     double tol, tol_nodes, close, near, least, narrow;  // near: the distance of the mode that does where sites are warm
     int nodes, stage;                        // at most so many points, so many a stage
@@ -108,7 +108,7 @@ struct EpLearnArgs {
     long* sweeps_used;
     double *mean, *sd, *quantile_lo, *quantile_hi;           // (groups,), only the free ones written: half-widths, variances
     double *found_rate, *effective;                          // rate of outliers; effective number of nodes
-    double *told_pull, *told_precision;                      // (groups,), (groups,groups): what the rows tell
+    double *told_pull, *told_precision, *told_power;         // (groups,), (groups,groups), (groups,): what the rows tell
     int columns;                                             // nodes in whole registers
     double *lanes, *lane_phi;  // (2 sites, columns): m and nu, then D and tau, of each; (columns, q) its parameters, or NaN
     bool* finite;                                            // whether x and P are
@@ -122,4 +122,4 @@ HW_WIDE_KERNEL(std::size_t, ep_workspace, const hw::EpArgs& args)
 HW_WIDE_KERNEL(int, ep_run, const hw::EpArgs& args)
 HW_WIDE_KERNEL(std::size_t, ep_learn_workspace, const hw::EpLearnArgs& args)
 HW_WIDE_KERNEL(int, ep_learn, const hw::EpLearnArgs& args)
-HW_WIDE_KERNEL(void, ep_known_part, int p, const bool* free, const double* pull, const double* precision, double* found_pull, double* found_precision, double* work)
+HW_WIDE_KERNEL(void, ep_known_part, int p, const bool* free, const double* start, const double* pull, const double* precision, const double* power, double* found_pull, double* found_precision, double* found_power, double* work)

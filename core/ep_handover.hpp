@@ -1,12 +1,15 @@
 // What a solved window of a stream takes over from the one before, and what it hands on: plain numbers, no lanes.
 //
-// Half-widths: what other rows told of them is a quadratic pull'u - u'precision u / 2 in u = s^warp over all of them, of
-// which a window takes the part of its free ones (`ep_known`). What its own rows tell is the quadratic with
+// Half-widths: what other rows told of them is a factor s^power exp(pull's - s'precision s / 2) over all of them, of which
+// a window takes the part of its free ones (`ep_taken`). What its own rows tell (`ep_told`) has
 //
-//     H = -Cov(g, u) Cov(u)^-1,    pull = E g + H E u,    g = d log Z / du,
+//     precision = -Cov(g - power / s, s) Cov(s)^-1,    pull = E (g - power / s) + precision E s,    g = d log Z / ds,
 //
-// the moments being those of the posterior over u, the weighted nodes (`ep_told`). What log Z lacks to second order has no
-// slope of its own: pull gets that of a line through the nodes, Cov(u)^-1 Cov(u, second).
+// the moments being those of the posterior over s, the weighted nodes, and power_j by regression of g_j on s and 1 / s_j, no
+// less than 0 and no more than leaves a Gaussian that falls. A half-width that is well seen has a power and next to no precision, one that drowns in the others no power: it
+// is felt through its variance, s^2. So what windows tell whose posterior is wide is true where later ones find it.
+// What log Z lacks to second order has no slope of its own: pull gets that of a line through the nodes,
+// Cov(s)^-1 Cov(s, second).
 // State: the forwards message of the sites (`ep_edge`), of which a later window takes the one before its first row.
 // Sites: those of the rows that two windows share (`ep_moved`).
 #pragma once
@@ -16,6 +19,9 @@
 
 namespace hw {
 namespace HW_ISA {
+
+// share of the variance of 1 / s that no line in s may explain, for the nodes to tell a power
+constexpr double ep_bent = 1e-3;
 
 // A (n,n) symmetric -> its eigenvalues on the diagonal, V (n,n) its eigenvectors as columns; cyclic rotations (Jacobi)
 inline void ep_eigen(int n, double* A, double* V) {
@@ -122,6 +128,31 @@ inline void ep_known(int p, const bool* free, const double* pull, const double* 
     }
 }
 
+// What a window takes of what is known of p half-widths: found_pull (p,), found_precision (p,p), found_power (p,). It is made
+// proper with the powers to second order in s about the start (p,); one stays a power where a falling Gaussian is left
+// beside it. work (5 p (p + 1))
+inline void ep_taken(int p, const bool* free, const double* start, const double* pull, const double* precision, const double* power,
+                     double* found_pull, double* found_precision, double* found_power, double* work) {
+    double *whole = work, *whole_precision = whole + p;
+    const auto curve_of = [&](int i) {
+        const double curve = power[i] / (start[i] * start[i]);
+        return free[i] && power[i] > 0.0 && finite(curve) ? curve : 0.0;
+    };
+    for (int i = 0; i < p; i++) {
+        whole[i] = pull[i] + 2.0 * curve_of(i) * start[i];
+        for (int j = 0; j < p; j++) whole_precision[i * p + j] = precision[i * p + j] + (i == j ? curve_of(i) : 0.0);
+    }
+    ep_known(p, free, whole, whole_precision, found_pull, found_precision, work + p * (p + 1));
+    for (int i = 0; i < p; i++) {
+        found_power[i] = 0.0;
+        const double curve = curve_of(i), left = found_precision[i * p + i] - curve;
+        if (!(curve > 0.0 && left >= 0.0)) continue;
+        found_power[i] = power[i];
+        found_precision[i * p + i] = left;
+        found_pull[i] -= 2.0 * curve * start[i];
+    }
+}
+
 // Weights (count,) of nodes that sum to 1, the logarithms flattened by `flat`; returns their effective number.
 inline double ep_weights(int count, const double* log_weight, const bool* keep, double flat, double* w) {
     double top = -__builtin_inf(), sum = 0.0, square = 0.0;
@@ -199,64 +230,88 @@ inline void ep_widths(const EpLearnArgs& a, int q, double* work) {
     }
 }
 
-// What the rows of the window tell of its half-widths: told_pull (groups,), told_precision (groups,groups).
+// What the rows of the window tell of its half-widths: told_pull (groups,), told_precision (groups,groups), told_power.
 // work (count (2 q + 2))
 inline void ep_told(const EpLearnArgs& a, int q, double* work) {
     const int K = *a.used, p = a.base.groups;
     int group[ep_free], f = 0;
     for (int g = 0; g < p; g++) {
         if (a.free[g]) group[f++] = g;
-        a.told_pull[g] = 0.0;
+        a.told_pull[g] = a.told_power[g] = 0.0;
         for (int i = 0; i < p; i++) a.told_precision[g * p + i] = 0.0;
     }
     if (f == 0) return;
-    double *w = work, *u = w + K, *d = u + std::ptrdiff_t(K) * f;
+    double *w = work, *s = w + K, *d = s + std::ptrdiff_t(K) * f;
     bool* keep = reinterpret_cast<bool*>(d + std::ptrdiff_t(K) * f);
     int sound = 0;
     for (int k = 0; k < K; k++) {
         keep[k] = finite(a.log_weight[k]);
         for (int j = 0; j < f; j++) {
-            u[k * f + j] = std::exp(a.warp * a.phi[k * q + j]);
-            d[k * f + j] = a.node_slope[k * q + j] / (a.warp * u[k * f + j]);
+            s[k * f + j] = std::exp(a.phi[k * q + j]);
+            d[k * f + j] = a.node_slope[k * q + j] / s[k * f + j];
             keep[k] = keep[k] && finite(d[k * f + j]);
         }
         sound += keep[k];
     }
-    double H[ep_free * ep_free] = {}, pull[ep_free] = {};
+    double H[ep_free * ep_free] = {}, pull[ep_free] = {}, power[ep_free] = {};
     if (K == 1) {
         for (int i = 0; i < f; i++)
             for (int j = 0; j < f; j++) {
-                H[i * f + j] = a.H[i * q + j] / (a.warp * a.warp * u[i] * u[j]);
-                if (a.pull) H[i * f + j] -= a.precision[group[i] * p + group[j]];
+                H[i * f + j] = a.H[i * q + j] / (s[i] * s[j]);
+                if (!a.pull) continue;
+                H[i * f + j] -= a.precision[group[i] * p + group[j]] + (i == j ? a.known_power[group[i]] / (s[i] * s[i]) : 0.0);
             }
         for (int i = 0; i < f; i++) {
             pull[i] = d[i];
-            for (int j = 0; j < f; j++) pull[i] += H[i * f + j] * u[j];
+            for (int j = 0; j < f; j++) pull[i] += H[i * f + j] * s[j];
         }
     } else {
         if (sound < f + 2) return;
         constexpr double flatter[4] = {1.0, 0.5, 0.25, 0.0};
         for (const double flat : flatter)  // few nodes carry the weight: they alone cannot tell a slope
             if (ep_weights(K, a.log_weight, keep, flat, w) > 2.0 * f + 2.0) break;
-        double mean[ep_free] = {}, level[ep_free] = {}, more[ep_free] = {}, S[ep_free * ep_free] = {}, X[ep_free * ep_free] = {}, L[ep_free * ep_free], pivot[ep_free], inverse[ep_free];
+        // moments: means of s, d and 1 / s; covariances of s with second, s, d and 1 / s; of 1 / s_j with itself and with d_j
+        double mean[ep_free] = {}, level[ep_free] = {}, over[ep_free] = {}, more[ep_free] = {}, own[ep_free] = {}, with[ep_free] = {};
+        double S[ep_free * ep_free] = {}, X[ep_free * ep_free] = {}, Y[ep_free * ep_free] = {}, B[ep_free * ep_free];
+        double L[ep_free * ep_free], pivot[ep_free], inverse[ep_free];
         for (int k = 0; k < K; k++)
             if (keep[k])
                 for (int j = 0; j < f; j++) {
-                    mean[j] += w[k] * u[k * f + j];
+                    mean[j] += w[k] * s[k * f + j];
                     level[j] += w[k] * d[k * f + j];
+                    over[j] += w[k] / s[k * f + j];
                 }
         for (int k = 0; k < K; k++)
             if (keep[k])
                 for (int i = 0; i < f; i++)
                     for (int j = 0; j < f; j++) {
-                        const double du = w[k] * (u[k * f + i] - mean[i]);
-                        if (j == 0) more[i] += du * a.second[k];
-                        S[i * f + j] += du * (u[k * f + j] - mean[j]);
-                        X[i * f + j] += du * (d[k * f + j] - level[j]);
+                        const double ds = w[k] * (s[k * f + i] - mean[i]), other = 1.0 / s[k * f + j] - over[j];
+                        if (j == 0) more[i] += ds * a.second[k];
+                        S[i * f + j] += ds * (s[k * f + j] - mean[j]);
+                        X[i * f + j] += ds * (d[k * f + j] - level[j]);
+                        Y[i * f + j] += ds * other;
+                        if (i == j) {
+                            own[j] += w[k] * other * other;
+                            with[j] += w[k] * other * (d[k * f + j] - level[j]);
+                        }
                     }
         for (int j = 0; j < f; j++) S[j * f + j] *= 1.0 + 1e-6;
         ldl(Dim<0>(f), S, L, pivot, inverse);
+        for (int i = 0; i < f * f; i++) B[i] = Y[i];
+        ldl_solve(Dim<0>(f), Dim<0>(f), L, inverse, B);
         ldl_solve(Dim<0>(f), Dim<0>(f), L, inverse, X);
+        for (int j = 0; j < f && sound >= 2 * f + 4; j++) {
+            double left = own[j], felt = with[j];  // of what no line in s explains
+            for (int i = 0; i < f; i++) {
+                left -= Y[i * f + j] * B[i * f + j];
+                felt -= Y[i * f + j] * X[i * f + j];
+            }
+            const double falls = X[j * f + j] / B[j * f + j];  // a power that leaves no Gaussian beside it
+            if (!(left > ep_bent * own[j] && felt > 0.0 && falls > 0.0 && B[j * f + j] < 0.0)) continue;
+            power[j] = min2(felt / left, falls);
+            level[j] -= power[j] * over[j];
+            for (int i = 0; i < f; i++) X[i * f + j] -= power[j] * B[i * f + j];
+        }
         ldl_solve(Dim<0>(f), Dim<1>(), L, inverse, more);
         for (int i = 0; i < f; i++)
             for (int j = 0; j < f; j++) H[i * f + j] = -0.5 * (X[i * f + j] + X[j * f + i]);
@@ -268,9 +323,10 @@ inline void ep_told(const EpLearnArgs& a, int q, double* work) {
     for (int i = 0; i < f * f; i++)
         if (!finite(H[i])) return;
     for (int i = 0; i < f; i++)
-        if (!finite(pull[i])) return;
+        if (!finite(pull[i]) || !finite(power[i])) return;
     for (int i = 0; i < f; i++) {
         a.told_pull[group[i]] = pull[i];
+        a.told_power[group[i]] = power[i];
         for (int j = 0; j < f; j++) a.told_precision[group[i] * p + group[j]] = H[i * f + j];
     }
 }

@@ -3,7 +3,7 @@
 // phi = log s of the free half-widths, logit eps last if it is learned. The prior of a rate is a beta law. That of log s is
 // s^power told^reference on (floor, cap), told^2 = mean over the rows of (1 - posterior variance / (s^2 / 3))^2: the square
 // root of what a row tells of log s (Jeffreys) and a power, 0 where the noise drowns and steady where it is seen. It has
-// no scale of its own. What other data have told is a term pull'u - u'precision u / 2 beside it, u = s^warp.
+// no scale of its own. What other data have told is a factor s^known_power exp(pull's - s'precision s / 2) beside it.
 // log p(phi | y) = log Z(phi) + log prior(phi) is climbed by Newton steps: of the lanes one holds phi, the others
 // phi + h e_j, whose slopes give columns of the Hessian, other coordinates at the next step where there are more
 // coordinates than lanes. Then points are evaluated, `stage` by `stage`: the first stage around the mode with the
@@ -32,6 +32,7 @@ constexpr double ep_wide = 1.15;  // by how much a stage reaches farther than th
 constexpr double ep_some = 10.0;  // effective points without which the evidence itself is in doubt
 constexpr int ep_few = 2;     // rows that may come or go while the mode stays
 constexpr double ep_sure = 0.25;  // standard deviations in which a step of Newton errs by no more than the mode may
+constexpr double ep_apart = 1.0;  // disagreement of moments, in standard deviations, beyond which no step is taken
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
 template <class N>
@@ -93,9 +94,8 @@ struct EpLearner {
                              : a.beta_a - (a.beta_a + a.beta_b) / (1.0 + std::exp(-phi[j]));
     }
 
-    // What is known already of the half-widths: its logarithm up to a constant, its slope in log s_j, and minus the
-    // curvature of the Gaussian in it.
-    double power_of(int j, const double* phi) const { return std::exp(a.warp * phi[j]); }
+    // What is known already of the half-widths: its logarithm up to a constant, its slope in log s_j, and minus its
+    // curvature in s times s_i s_j.
     double precision(int i, int j) const { return a.precision[group[i] * a.base.groups + group[j]]; }
     double known(const double* phi) const {
         double p = 0.0;
@@ -104,8 +104,8 @@ struct EpLearner {
                 if (group[i] >= 0) {
                     double half = a.pull[group[i]];
                     for (int j = 0; j < q; j++)
-                        if (group[j] >= 0) half -= 0.5 * precision(i, j) * power_of(j, phi);
-                    p += half * power_of(i, phi);
+                        if (group[j] >= 0) half -= 0.5 * precision(i, j) * std::exp(phi[j]);
+                    p += half * std::exp(phi[i]) + a.known_power[group[i]] * phi[i];
                 }
         return p;
     }
@@ -113,12 +113,12 @@ struct EpLearner {
         if (!a.pull) return 0.0;
         double d = a.pull[group[i]];
         for (int j = 0; j < q; j++)
-            if (group[j] >= 0) d -= precision(i, j) * power_of(j, phi);
-        return a.warp * power_of(i, phi) * d;
+            if (group[j] >= 0) d -= precision(i, j) * std::exp(phi[j]);
+        return std::exp(phi[i]) * d + a.known_power[group[i]];
     }
     double known_curve(int i, int j, const double* phi) const {
         if (!a.pull || group[i] < 0 || group[j] < 0) return 0.0;
-        return a.warp * a.warp * power_of(i, phi) * power_of(j, phi) * precision(i, j);
+        return std::exp(phi[i] + phi[j]) * precision(i, j) + (i == j ? a.known_power[group[i]] : 0.0);
     }
 
     // parameters of lane l
@@ -467,7 +467,9 @@ struct EpLearner {
             evaluate_inside(at, begin == afresh ? a.many : a.few, 0.3 * a.tol, value, slope, begin, *best == minus_inf);
             double may = 0.05 * q;
             for (int j = 0; j < q; j++) may += 2.0 * a.reference * std::fabs(d[j]);
-            if (!(value[0] - log_told(0) > kept_value - may) && refused < 6) {  // too far, or no trajectory fits
+            // too far, or no trajectory fits: where moments run apart the evidence says nothing
+            const bool lost = !(value[0] > minus_inf) || (*best > minus_inf && !(f.residual[0] < ep_apart));
+            if ((lost || !(value[0] - log_told(0) > kept_value - may)) && refused < 6) {
                 refused++;
                 if (*best == minus_inf) {  // the start itself: wider half-widths fit more
                     for (int j = 0; j < q; j++) phi[j] = min2(max2(phi[j] + (group[j] >= 0 ? 0.7 : 0.0), lo[j]), hi[j]);
@@ -479,7 +481,7 @@ struct EpLearner {
                 }
                 continue;
             }
-            if (value[0] == minus_inf) return 2;
+            if (lost) return 1;  // stays where it was
             refused = 0;
             *best = value[0];
             kept_value = value[0] - log_told(0);

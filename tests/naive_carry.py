@@ -21,39 +21,57 @@ def known(free, pull, precision):
     return found_pull, found
 
 
-def told(free, found, warp, before=None):
-    """Return pull and precision of what a window tells; `before` is the precision of what was known, for one node."""
+def taken(free, start, pull, precision, power):
+    """Return pull, precision and power of the free half-widths alone, proper, the powers to second order about `start`."""
+    curve = np.where(free & (power > 0), power / start**2, 0.0)
+    found_pull, found = known(free, pull + 2 * curve * start, precision + np.diag(curve))
+    keep = (curve > 0) & (np.diagonal(found) >= curve)
+    return found_pull - np.where(keep, 2 * curve * start, 0), found - np.diag(keep * curve), np.where(keep, power, 0.0)
+
+
+def told(free, found, before=None):
+    """Return pull, precision and power of what a window tells; `before`: precision and power known already, for one node."""
     f = np.flatnonzero(free)
     q, K = f.size, int(found["nodes"])
-    pull, precision = np.zeros(len(free)), np.zeros((len(free), len(free)))
+    pull, precision, power = np.zeros(len(free)), np.zeros((len(free), len(free))), np.zeros(len(free))
     log_weight = found["log_weight"][:K]
-    u = np.exp(warp * found["phi"][:K, :q])
-    g = found["slope"][:K, :q] / (warp * u)
+    s = np.exp(found["phi"][:K, :q])
+    g = found["slope"][:K, :q] / s
     if K == 1:
-        H = found["H"][:q, :q] / (warp**2 * u[0][:, None] * u[0])
+        H = found["H"][:q, :q] / (s[0][:, None] * s[0])
         if before is not None:
-            H = H - before[np.ix_(f, f)]
-        h = g[0] + H @ u[0]
+            H = H - before[0][np.ix_(f, f)] - np.diag(before[1][f] / s[0] ** 2)
+        h = g[0] + H @ s[0]
     else:
         sound = np.isfinite(log_weight) & np.isfinite(g).all(axis=1)
-        u, g, log_weight, second = u[sound], g[sound], log_weight[sound], found["second"][:K][sound]
-        if len(u) < q + 2:
-            return pull, precision
+        s, g, log_weight, second = s[sound], g[sound], log_weight[sound], found["second"][:K][sound]
+        if len(s) < q + 2:
+            return pull, precision, power
         for flat in (1.0, 0.5, 0.25, 0.0):
             w = np.exp(flat * (log_weight - log_weight.max()))
             w /= w.sum()
             if 1.0 / (w @ w) > 2 * q + 2:
                 break
-        mean, level = w @ u, w @ g
-        du, dg = u - mean, g - level
-        S = (w[:, None] * du).T @ du
+        mean = w @ s
+        ds = s - mean
+        S = (w[:, None] * ds).T @ ds
         S[np.diag_indices(q)] *= 1.0 + 1e-6
-        H = -np.linalg.solve(S, (w[:, None] * du).T @ dg)
+        for j in range(q):  # the part of 1 / s_j that no line in s explains
+            over = 1.0 / s[:, j] - w @ (1.0 / s[:, j])
+            line = np.linalg.solve(S, ds.T @ (w * over))
+            left, felt = w @ over**2 - (ds.T @ (w * over)) @ line, w @ (over * (g[:, j] - w @ g[:, j]))
+            felt -= (ds.T @ (w * (g[:, j] - w @ g[:, j]))) @ line
+            own = np.linalg.solve(S, ds.T @ (w * (g[:, j] - w @ g[:, j])))[j]
+            if len(s) >= 2 * q + 4 and left > 1e-3 * (w @ over**2) and felt > 0 and own < 0 and line[j] < 0:
+                power[f[j]] = min(felt / left, own / line[j])
+        g = g - power[f] / s
+        level = w @ g
+        H = -np.linalg.solve(S, (w[:, None] * ds).T @ (g - level))
         H = 0.5 * (H + H.T)
-        h = level + np.linalg.solve(S, du.T @ (w * second)) + H @ mean
+        h = level + np.linalg.solve(S, ds.T @ (w * second)) + H @ mean
     precision[np.ix_(f, f)] = H
     pull[f] = h
-    return pull, precision
+    return pull, precision, power
 
 
 def widths(free, found):

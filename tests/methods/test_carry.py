@@ -6,7 +6,7 @@ import pytest
 from tests import naive_carry
 
 import halfwidth as hw
-from halfwidth.methods._carry import WARP, Carried, Known, Start, inside
+from halfwidth.methods._carry import Carried, Known, Start, inside
 from halfwidth.methods._sites import sites
 
 A = np.array([[1, -0.5, 0.2], [0.5, 0.1, 0], [0.3, 0, -0.1]])
@@ -65,11 +65,10 @@ def test_what_a_window_tells_is_the_slope_of_its_evidence():
         found = _core.ep_run(chain.problem, s[None].copy(), np.zeros(1), 200, 1e-8, 1.0, None)
         return found["log_z"][0] + found["second"][0]
 
-    at = np.sqrt(s)
     for direction in np.eye(5):
-        h = 0.03 * at * direction
-        slope = (evidence((at + h) ** 2) - evidence((at - h) ** 2)) / 2
-        ours = known.pull @ h - h @ known.precision @ at
+        h = 0.06 * s * direction
+        slope = (evidence(s + h) - evidence(s - h)) / 2
+        ours = known.pull @ h - h @ known.precision @ s + known.power @ (h / s)
         assert ours == pytest.approx(slope, abs=0.35)
 
 
@@ -108,22 +107,23 @@ def test_a_stream_knows_what_the_batch_knows():
 
 def test_no_row_speaks_twice():
     carried = Carried(1, 1e12)
-    one = Known(np.ones(1), np.ones((1, 1)))
+    one = Known(np.ones(1), np.ones((1, 1)), np.ones(1))
     for newest in range(40):  # windows of 10 rows, each telling 1 in all
         known = carried.known(newest - 9, 10)
         gone = max(newest - 9, 0)
-        assert (0.0 if known is None else known.precision[0, 0]) <= gone / 10 + 1e-9
+        for told in () if known is None else known:
+            assert told.item() <= gone / 10 + 1e-9
         carried.waiting.append((newest, one.times(0.1), Known.none(1)))
     assert carried.gone.precision[0, 0] == pytest.approx(3.0)
 
 
 def test_of_marginalises_and_keeps_what_is_proper():
     H = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, -1.0]])
-    known = Known(np.array([1.0, 2.0, 3.0]), H)
-    part = Known(*_core.ep_known(np.array([True, False, True]), known.pull, known.precision))
-    assert part.precision[0, 0] == pytest.approx(4 - 1 / 2)
-    assert part.pull[0] == pytest.approx(1 - 2 / 2)
-    assert part.precision[2, 2] == part.pull[2] == 0.0
+    free = np.array([True, False, True])
+    pull, precision, _ = _core.ep_known(free, np.ones(3), np.array([1.0, 2.0, 3.0]), H, np.zeros(3))
+    assert precision[0, 0] == pytest.approx(4 - 1 / 2)
+    assert pull[0] == pytest.approx(1 - 2 / 2)
+    assert precision[2, 2] == pull[2] == 0.0
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -136,9 +136,28 @@ def test_what_is_known_of_the_free_ones_equals_the_twin(seed):
     free = rng.random(p) < 0.6
     if seed == 5:
         H, free = np.zeros((p, p)), np.ones(p, dtype=bool)
-    pull = rng.standard_normal(p)
-    for ours, twin in zip(_core.ep_known(free, pull, H), naive_carry.known(free, pull, H), strict=True):
-        np.testing.assert_allclose(ours, twin, rtol=1e-9, atol=1e-9 * max(np.abs(twin).max(), 1e-9))
+    pull, start = rng.standard_normal(p), 10.0 ** rng.uniform(-1, 1, p)
+    for power in (np.zeros(p), np.abs(np.diagonal(H)) * start**2 * rng.exponential(1.0, p)):
+        args = free, start, pull, H, power
+        for ours, twin in zip(_core.ep_known(*args), naive_carry.taken(*args), strict=True):
+            np.testing.assert_allclose(ours, twin, rtol=1e-8, atol=1e-9 * max(np.abs(twin).max(), 1e-9))
+
+
+def test_a_power_and_a_line_are_a_gamma_law():
+    # Of a record that says little s^power exp(pull s) is all that is known: mean -(power + 1) / pull where log s is flat.
+    _, record = drawn(3, 1)
+    known = Known(np.full(5, -4000.0), np.zeros((5, 5)), np.full(5, 400.0))
+    widths = hw.Posterior().answer(system(UNKNOWN, UNKNOWN), record, known=known).estimate.info["half_widths"]
+    np.testing.assert_allclose(widths["mean"], 0.1, rtol=0.02)
+    np.testing.assert_allclose(widths["sd"], 0.005, rtol=0.2)
+
+
+def test_a_power_beside_a_growing_gaussian_is_no_power():
+    grows = np.array([[-60.0]])
+    pull, precision, power = _core.ep_known(np.array([True]), np.ones(1), np.ones(1), grows, np.array([100.0]))
+    assert power[0] == 0.0
+    assert precision[0, 0] == pytest.approx(40.0)
+    assert pull[0] == pytest.approx(201.0)
 
 
 @pytest.mark.parametrize("nodes", [1, 7, 40])
@@ -148,11 +167,11 @@ def test_what_a_window_hands_on_equals_the_twin(nodes):
     y[3] = y[7:9, 0] = np.nan
     F, E = np.array([[1, 0.4], [0, 1]]), np.array([[1, 0.3, 0.1], [0, 1, 0.2], [0, 0, 1]])
     model = system(UNKNOWN, UNKNOWN, bounds=BOX, F=F, E=E)
-    known = Known(np.full(5, 0.3), np.eye(5) + 0.2)
+    known = Known(np.full(5, 0.3), np.eye(5) + 0.2, np.array([0.0, 2.0, 0.1, 5.0, 0.0]))
     found = (answer := hw.Posterior(nodes=nodes).answer(model, hw.Record(record.t, y), known=known)).found
     free = answer.chain.free
-    for ours, twin in zip(answer.told, naive_carry.told(free, found, WARP, known.precision), strict=True):
-        np.testing.assert_allclose(ours, twin, rtol=1e-8, atol=1e-8 * np.abs(twin).max())
+    for ours, twin in zip(answer.told, naive_carry.told(free, found, (known.precision, known.power)), strict=True):
+        np.testing.assert_allclose(ours, twin, rtol=1e-7, atol=1e-7 * np.abs(twin).max())
     *widths, effective = naive_carry.widths(free, found)
     for name, twin in zip(("mean", "sd", "lo", "hi"), widths, strict=True):
         np.testing.assert_allclose(found[name][free], twin, rtol=1e-10)
@@ -183,7 +202,7 @@ def test_sites_go_along_with_their_rows():
 def test_nodes_that_are_taken_over_are_as_good_as_fresh_ones():
     _, record = drawn(40, 11)
     model = system(UNKNOWN, UNKNOWN, bounds=BOX)
-    known = Known(300.0 * np.sqrt(TRUE), 300.0 * np.eye(5))  # of rows before
+    known = Known(75.0 * np.ones(5), np.diag(75.0 / TRUE), np.zeros(5))  # of rows before
     start, since = None, []
     for first in range(6):
         part = hw.Record(record.t[first : first + 25], record.y[first : first + 25])
@@ -307,7 +326,7 @@ def test_the_evidence_of_bounds_alone():
     for j in range(3):
         more, less = s.copy(), s.copy()
         more[j], less[j] = 0.36, 0.25
-        ours = [known.pull @ np.sqrt(v) - 0.5 * np.sqrt(v) @ known.precision @ np.sqrt(v) for v in (more, less)]
+        ours = [known.pull @ v - 0.5 * v @ known.precision @ v for v in (more, less)]
         assert ours[0] - ours[1] == pytest.approx(share(more) - share(less), abs=0.05)
     assert inside(sites(system(UNKNOWN, UNKNOWN), record), s).precision.any() == np.False_
 

@@ -270,6 +270,30 @@ def test_a_mode_in_the_corner_of_its_bounds_is_no_infeasibility():
     assert np.mean(inside) > 0.85
 
 
+@pytest.mark.parametrize(("seed", "T"), [(25, 260), (26, 260), (23, 400)])
+def test_hundreds_of_rows_between_bounds_are_no_infeasibility(seed, T):
+    # The first steps of the search lead where no trajectory fits, and the moments run apart.
+    lo, hi = np.array([-0.80, -0.61, -0.40]), np.array([0.76, 0.66, 0.44])
+    rng, x, X, U = np.random.default_rng(seed), np.zeros(3), [], []
+    for _ in range(T + 30):
+        for attempt in range(10_000):
+            if attempt % 100 == 0:
+                u = rng.uniform(-1, 1, 1)
+            new = A @ x + np.array([0.1, 0.6, 0.3]) * u + rng.uniform(-0.1, 0.1, 3)
+            if np.all((lo <= new) & (new <= hi)):
+                break
+        x = new
+        X.append(x)
+        U.append(u)
+    states, u = np.array(X)[30:], np.array(U)[30:]
+    record = hw.Record(np.arange(1.0, T + 1), states @ C.T + rng.uniform(-0.3, 0.3, (T, 2)), u)
+    own = hw.Uniform.unknown(at_most=1.0)
+    est = hw.estimate(paper(own, own, hw.Box(lo, hi), bounds=hw.Box(lo, hi)), record, hw.Posterior(nodes=16))
+    assert est.status.good
+    low, high = est.interval(0.9)
+    assert 0.8 < np.mean((low <= states) & (states <= high)) < 0.97
+
+
 def test_more_unknowns_than_it_finds_are_refused():
     n = 9
     many = hw.Linear(0.9 * np.eye(n), None, np.eye(n), UNKNOWN, UNKNOWN, hw.Box(-np.ones(n), np.ones(n)))

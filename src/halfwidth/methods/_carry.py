@@ -1,19 +1,23 @@
 """What a window of `Posterior` hands on when rows leave it: knowledge of half-widths and of the state at its edge.
 
 Half-widths are constant or drift slowly, so what a row told of them stays true after the row has left. The evidence of
-window i is, about its posterior, a quadratic in u = s^(1/2),
+window i is, about its posterior, a power beside a Gaussian,
 
-    log Z_i(u) ~ pull_i' u - u' H_i u / 2,    H_i = -Cov(g, u) Cov(u)^-1,    pull_i = E g + H_i E u,
+    log Z_i(s) ~ sum_j power_ij log s_j + pull_i' s - s' H_i s / 2,
+    H_i = -Cov(g - power_i / s, s) Cov(s)^-1,    pull_i = E (g - power_i / s) + H_i E s,
 
-where g is the slope of log Z_i and the moments are those of the posterior over u (the nodes of `Posterior`). A row lies
-in as many windows as a window has rows, N: each window counts 1 / N, and only once **all** of its rows have left, so no
-row speaks twice and the prior of the newest window holds none of its own data. The sum of overlapping window
-likelihoods is a composite likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by
-exp(-1 / rows) a row.
+where g is the slope of log Z_i in s, power_ij >= 0 what g_j has along 1 / s_j beside a line, and the moments are those
+of the posterior over s (the nodes of `Posterior`). A half-width that is well seen leaves a power and a falling line;
+one that drowns in other noise is felt through s^2 and leaves a parabola about 0. A quadratic in log s or s^(1/2) fits
+the first alone: early windows, whose posterior is wide, would make the second smaller than it is. A row lies in as
+many windows as a window has rows, N: each window counts 1 / N, and only once **all** of its rows have left, so no row
+speaks twice and the prior of the newest window holds none of its own data. The sum of overlapping window likelihoods
+is a composite likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by exp(-1 / rows)
+a row.
 
 As a factor of the evidence bounds count as an event that small half-widths make likely, and over many windows that adds
 up. So they are a condition in all rows but 26, those of the newest window and those that have left alike
-(`condition`): a quadratic of log P(inside | u), the evidence of the chain with its bounds alone, is taken off. It is
+(`condition`): a quadratic of log P(inside | s), the evidence of the chain with its bounds alone, is taken off. It is
 found anew in every N-th window.
 
 The state before the first row of a window is what the sites of the rows that have left make of it: the forwards message
@@ -38,8 +42,6 @@ from halfwidth.spread import Normal
 if TYPE_CHECKING:
     from halfwidth.methods.posterior import Answer
 
-#: Power of a half-width in which its posterior is nearly Gaussian: 0 is no tail there.
-WARP = 0.5
 #: Sweeps of the chain with its bounds alone, and the log share of a cavity inside a bound from which it is believed.
 _SWEEPS, _WORST = 50, -60.0
 
@@ -58,23 +60,24 @@ def condition(rows: float) -> float:
 
 
 class Known(NamedTuple):
-    """What is known of half-widths (q, r): the logarithm pull' u - u' precision u / 2 in u = s^(1/2)."""
+    """What is known of half-widths s = (q, r): a factor s^power exp(pull' s - s' precision s / 2)."""
 
     pull: Array
     precision: Array
+    power: Array
 
     @classmethod
     def none(cls, p: int) -> "Known":
         """Nothing is known of p half-widths."""
-        return cls(np.zeros(p), np.zeros((p, p)))
+        return cls(np.zeros(p), np.zeros((p, p)), np.zeros(p))
 
     def plus(self, other: "Known", weight: float = 1.0) -> "Known":
         """Add what other rows told."""
-        return Known(self.pull + weight * other.pull, self.precision + weight * other.precision)
+        return Known(*(own + weight * more for own, more in zip(self, other, strict=True)))
 
     def times(self, weight: float) -> "Known":
         """Return it weighted."""
-        return Known(weight * self.pull, weight * self.precision)
+        return Known(*(weight * own for own in self))
 
 
 def inside(chain: Sites, s: Array) -> Known:
@@ -92,11 +95,10 @@ def inside(chain: Sites, s: Array) -> Known:
     column = (g[1 : q + 1] - g[q + 1 :]) / (2.0 * h)
     if not (np.isfinite(found["log_z"]).all() and np.isfinite(column).all() and (found["worst"] > _WORST).all()):
         return known
-    u = s[free] ** WARP
-    slope = g[0] / (WARP * u)
-    H = -(0.5 * (column + column.T) - np.diag(WARP * g[0])) / (WARP**2 * u[:, None] * u)
+    s = s[free]
+    H = -(0.5 * (column + column.T) - np.diag(g[0])) / (s[:, None] * s)
     known.precision[np.ix_(free, free)] = H
-    known.pull[free] = slope + H @ u
+    known.pull[free] = g[0] / s + H @ s
     return known
 
 

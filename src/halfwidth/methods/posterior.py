@@ -38,7 +38,7 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
-from halfwidth.methods._carry import HANDED_ON, WARP, Carried, Known, Start, condition
+from halfwidth.methods._carry import HANDED_ON, Carried, Known, Start, condition
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Frame, Sites, frames_of, gaussian_part, sites, uniform_part, unknowns
 from halfwidth.model import Linear, Model, Nonlinear
@@ -48,9 +48,11 @@ from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box, Normal, Shaped
 
 #: Power of the half-widths' prior; see above.
-POWER = 0.5
+POWER = 0.4
 #: Nodes of a stage, and most stages (core/ep_learn.hpp).
 _STAGE, _STAGES = 16, 8
+#: Power of a half-width in which its posterior is nearly Gaussian: 0 is no tail there.
+WARP = 0.5
 #: Numbers that the beliefs of all nodes may take up; one stage is always had.
 _ROOM = 4e6
 #: Of the search and the nodes. The mode of the window before is a good centre of nodes up to the distance `near`, in
@@ -93,7 +95,7 @@ class Posterior:
         a half-width is the power alone, without `told`.
     nodes : int
         Most points over which unknown half-widths are integrated: no more are taken than what is left in doubt asks
-        for. 1 takes their mode as if it were the truth.
+        for, and no fewer than six and two for each unknown. 1 takes their mode as if it were the truth.
     outliers : float or bool
         Share of outputs that are outliers, whose noise is ten half-widths wide; True learns it. Each output noise needs
         a bounded part.
@@ -297,7 +299,7 @@ class Posterior:
             limits |= _OF_LONG
         n = len(chain.problem["m0"])
         room = int(_ROOM / (len(chain.problem["start"]) * n * (n + 3)))
-        count = 1 if q == 0 else min(self.nodes, max(room, _STAGE))
+        count = 1 if q == 0 or self.nodes == 1 else max(min(self.nodes, max(room, _STAGE)), 2 * q + 6)
         if q == 0:
             limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
@@ -322,7 +324,7 @@ class Posterior:
                 chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
                 chain.fitted, learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z,
                 limits, None if start is None else start.before, drop, shaped,
-                None if known is None else known.pull, None if known is None else known.precision,
+                *((None, None, None) if known is None else known),
                 chain.outside if limits["condition"] > 0 else None,
             )
         )  # fmt: skip
@@ -450,7 +452,7 @@ class Answer(NamedTuple):
     @property
     def told(self) -> Known:
         """What its rows tell of the half-widths."""
-        return Known(self.found["told_pull"], self.found["told_precision"])
+        return Known(*(self.found[name] for name in ("told_pull", "told_precision", "told_power")))
 
 
 @functools.lru_cache(maxsize=64)
