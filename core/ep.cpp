@@ -7,10 +7,13 @@ namespace hw {
 namespace HW_ISA {
 namespace {
 
+// two bytes a row, in registers
+std::size_t marks(const EpArgs& a) { return (2 * std::size_t(a.rows) + sizeof(V) - 1) / sizeof(V); }
+
 std::size_t block_size(const EpArgs& a) {
     const std::size_t stages = a.T + 1, n = a.n;
     const std::size_t shape = a.k3 ? stages * (6 * n * n + 2 * n) + 2 * std::size_t(a.rows) : 0;
-    return stages * (2 * n + n * (n + 1)) + stages * 2 * n + 2 * std::size_t(a.rows) + 4 * std::size_t(a.groups) + 4 + shape;
+    return stages * (2 * n + n * (n + 1)) + stages * 2 * n + 2 * std::size_t(a.rows) + 5 * std::size_t(a.groups) + 4 + marks(a) + shape;
 }
 
 struct Place {
@@ -37,6 +40,10 @@ void settle_in(Ep<N>& ep, EpFound& f, Place& place) {
     s.tau = place.take(a.rows);
     s.nu = place.take(a.rows);
     s.s = place.take(a.groups + 1);
+    s.log_box = place.take(a.groups);
+    s.axis = reinterpret_cast<signed char*>(place.take(marks(a)));
+    s.bends = s.axis + a.rows;
+    ep.axes();
     f.slope = place.take(a.groups + 1);
     f.learned = place.take(a.groups);
     if (!a.k3) return;
@@ -57,6 +64,7 @@ template <class N>
 int run(N n, const EpArgs& a) {
     for (int first = 0; first < a.members; first += wide_lanes) {
         Ep<N> ep{n, a, {first, a.members - 1}, {}, {}, 0};
+        ep.lone = a.members == 1;
         EpFound f{};
         Place place{reinterpret_cast<V*>(a.work)};
         settle_in(ep, f, place);

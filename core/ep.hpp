@@ -37,7 +37,8 @@ typedef V::Raw X;
 
 inline V of(X a) { return V::of(a); }
 inline V smaller(const V& a, const V& b) { return V::of(min4(a.v, b.v)); }
-inline V root(const V& a) { return V::of(sqrt4(a.v)); }
+inline V root(const V& a) { return V::of(root4(a.v)); }
+inline V over(const V& a) { return V::of(over4(a.v)); }
 inline V log_of(const V& a) { return V::of(log4(a.v)); }
 inline V either(decltype(X{} < X{}) test, const V& a, const V& b) { return V::of(test ? a.v : b.v); }
 
@@ -47,66 +48,86 @@ constexpr int shape_reach = 4;  // rows over which factors that are not Gaussian
 template <class N>
 constexpr int ep_cap = N::fixed ? N::cap : ep_states;
 
-// L (n,n) = lower Cholesky factor of a positive semidefinite M (n,n); directions below rounding are left out
+// L (n,n) = the unit lower factor of a positive semidefinite M (n,n), M = L D L', with D on its diagonal; directions below
+// rounding are left out
 template <class N>
-inline void ep_root(N n, const V* M, V* L) {
-    constexpr int c = ep_cap<N>;
-    V inverse[c];
+inline void ep_parts(N n, const V* M, V* L) {
     for (int i = 0; i < n; i++)
         for (int j = 0; j <= i; j++) L[i * n + j] = M[i * n + j];
     for (int j = 0; j < n; j++) {
         const V p = L[j * n + j], floor = V(1e-14) * M[j * n + j] + V(1e-300);
-        inverse[j] = either(p.v > floor.v, V(1.0) / p, V(0.0));
+        const V inverse = either(p.v > floor.v, over(p), V(0.0));
+        L[j * n + j] = either(p.v > floor.v, p, V(0.0));
         for (int i = j + 1; i < n; i++) {
-            const V share = L[i * n + j] * inverse[j];
+            const V share = L[i * n + j] * inverse;
             for (int k = j + 1; k <= i; k++) L[i * n + k] -= share * L[k * n + j];
         }
-    }
-    for (int j = 0; j < n; j++) {
-        const V scale = root(inverse[j]);
-        for (int i = 0; i < j; i++) L[i * n + j] = V(0.0);
-        for (int i = j; i < n; i++) L[i * n + j] *= scale;
+        for (int i = j + 1; i < n; i++) L[i * n + j] *= inverse;
     }
 }
 
-// out (n,n) = ((L L')^-1 + M)^-1 = L (I + L' M L)^-1 L' for a lower L and a symmetric M >= 0
+// out (n,n) = ((L D L')^-1 + M)^-1 = L (D^-1 + L' M L)^-1 L' for the parts of `ep_parts` and a symmetric M >= 0. With
+// X = L' M L, D^-1 + X has the pivots (1 + D_j X_jj) / D_j: nothing is divided by but what is at least 1.
 template <class N>
 inline void ep_join(N n, const V* L, const V* M, V* out) {
     constexpr int c = ep_cap<N>;
     V S[c * c], Y[c * c];
     for (int i = 0; i < n; i++)  // Y = M L
         for (int j = 0; j < n; j++) {
-            V s(0.0);
-            for (int k = j; k < n; k++) s += M[i * n + k] * L[k * n + j];
+            V s = M[i * n + j];
+            for (int k = j + 1; k < n; k++) s += M[i * n + k] * L[k * n + j];
             Y[i * n + j] = s;
         }
     for (int i = 0; i < n; i++)
         for (int j = 0; j <= i; j++) {
-            V s(i == j ? 1.0 : 0.0);
-            for (int k = i; k < n; k++) s += L[k * n + i] * Y[k * n + j];
+            V s = Y[i * n + j];
+            for (int k = i + 1; k < n; k++) s += L[k * n + i] * Y[k * n + j];
             S[i * n + j] = s;
         }
-    for (int j = 0; j < n; j++) {  // S = unit lower factor below the diagonal, 1 / pivot on it
-        const V over = either(S[j * n + j].v > X{}, V(1.0) / S[j * n + j], V(0.0));  // lost to rounding: left out
+    for (int j = 0; j < n; j++) {  // S = unit lower factor of D^-1 + X below the diagonal, 1 / pivot on it
+        const V pivot = V(1.0) + L[j * n + j] * S[j * n + j];
+        const V part = either(pivot.v > X{}, L[j * n + j] * over(pivot), V(0.0));  // lost to rounding: left out
         for (int i = j + 1; i < n; i++) {
-            const V share = S[i * n + j] * over;
+            const V share = S[i * n + j] * part;
             for (int k = j + 1; k <= i; k++) S[i * n + k] -= share * S[k * n + j];
         }
-        for (int i = j + 1; i < n; i++) S[i * n + j] *= over;
-        S[j * n + j] = over;
+        for (int i = j + 1; i < n; i++) S[i * n + j] *= part;
+        S[j * n + j] = part;
     }
     for (int j = 0; j < n; j++) {  // row j of L is column j of L'
         V* y = Y + j * n;
-        for (int i = 0; i < n; i++) y[i] = L[j * n + i];
+        for (int i = 0; i < n; i++) y[i] = i < j ? L[j * n + i] : V(i == j ? 1.0 : 0.0);
         unit_lower(n, S, y);
     }
-    for (int i = 0; i < n; i++)
+    for (int i = 0; i < n; i++) {
+        V scaled[c];
+        for (int k = 0; k < n; k++) scaled[k] = Y[i * n + k] * S[k * n + k];
         for (int j = 0; j <= i; j++) {
             V s(0.0);
-            for (int k = 0; k < n; k++) s += Y[i * n + k] * S[k * n + k] * Y[j * n + k];
+            for (int k = 0; k < n; k++) s += scaled[k] * Y[j * n + k];
             out[i * n + j] = out[j * n + i] = s;
         }
+    }
 }
+
+// A sum of logarithms: of products as far as they neither overflow nor lose digits.
+struct Logs {
+    V sum, product;
+    inline void clear() {
+        sum = V(0.0);
+        product = V(1.0);
+    }
+    inline void add(const V& a) {
+        const V p = product * a;
+        if (any4(~((p.v > all<X>(1e-200)) & (p.v < all<X>(1e200))))) {
+            sum += log_of(product) + log_of(a);
+            product = V(1.0);
+        } else {
+            product = p;
+        }
+    }
+    inline V value() const { return sum + log_of(product); }
+};
 
 // A stack of matrices for one block of members, brought into lanes.
 struct EpBlock {
@@ -133,7 +154,10 @@ struct EpState {
     V *m, *D;      // (T+1, n): sites of w; those of x_0 in row 0
     V *tau, *nu;   // (rows,): sites of rows, of the residual
     V *s;          // (groups,)
+    V *log_box;    // (groups,): log of the width of a box of each, while evidence is looked at
     V eps;         // rate of outliers or losses
+    signed char *axis;   // (rows,): the state that a row is a residual of, -1: of several
+    signed char *bends;  // (rows,): whether its tilted cumulants count
 };
 
 // What a sweep finds.
@@ -145,11 +169,12 @@ struct EpFound {
     V worst;      // smallest log of the share of a cavity that lies in its factor's box
     V top;        // what the evidence cannot exceed: every row as dense as its noise can be
     V far;        // largest squared distance of a site's mean from its cavity's, in the cavity's variances
+    Logs above, below;  // of log Z: half of what these sum up to is added and taken off
 };
 
 // What the shapes of the beliefs need, filled by `look`; null pointers: not wanted.
 struct EpCross {
-    V *S, *Pf;  // (T+1, n, n): covariance of x_t given all, and given what lies up to t
+    V *S, *Pf;  // (T+1, n, n): covariance of x_t given all; given what lies up to t, then the inverse of S
     V *B;       // (T+1, n, n): covariance of x_{t-1} with x_t
     V *X0, *X1; // (T+1, n, n): covariance of x_{t-1} and of x_t with w_t
     V *W;       // (T+1, n, n): covariance of w_t
@@ -171,6 +196,7 @@ struct Ep {
     // share below `faint`, says nothing at the precision that is asked for.
     double reach = 72.0, faint = 1e-13;
     bool mixed = false;  // rows with two explanations
+    bool lone = false;   // one member: its sites take the lanes
 
     // whether a shape that is asked for needs the cumulants of stage t
     inline bool bent(int) const { return cross.S; }  // `second` asks for all
@@ -212,7 +238,7 @@ struct Ep {
                 Tilted<X> r{};
                 r.mean = t.mean;
                 r.var = t.var;
-                if (depth >= evidence) r.log_z = t.log_z;
+                if (depth >= evidence) r.log_z = t.log_z();
                 if (depth == cumulants) {
                     r.k3 = t.k3;
                     r.k4 = t.k4;
@@ -309,32 +335,57 @@ struct Ep {
 
     // Lambda, eta: the future's message and the rows of t
     inline void ahead(int t, V* Lambda, V* eta) const {
-        unpack(s.Lb + t * packed(), Lambda);
+        const V* Lb = s.Lb + t * packed();
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j <= i; j++) Lambda[i * n + j] = Lb[tri(i, j)];
         for (int i = 0; i < n; i++) eta[i] = s.eb[t * n + i];
         for (int k = a.start[t]; k < a.start[t + 1]; k++) {
             if (silent(k)) continue;
+            const V lift = s.nu[k] + s.tau[k] * target(k);
+            if (const int i = s.axis[k]; i >= 0) {
+                eta[i] += lift;
+                Lambda[i * n + i] += s.tau[k];
+                continue;
+            }
             V h[cap];
             row(k, h);
-            const V lift = s.nu[k] + s.tau[k] * target(k);
             for (int i = 0; i < n; i++) {
                 const V th = s.tau[k] * h[i];
                 eta[i] += lift * h[i];
-                for (int j = 0; j < n; j++) Lambda[i * n + j] += th * h[j];
+                for (int j = 0; j <= i; j++) Lambda[i * n + j] += th * h[j];
             }
         }
+        for (int i = 0; i < n; i++)
+            for (int j = 0; j < i; j++) Lambda[j * n + i] = Lambda[i * n + j];
     }
     inline bool single(int k) const { return kind(k) < noise_contaminated || kind(k) == ep_truncation; }
     // a bound that no lane has come near
     inline bool silent(int k) const { return kind(k) == ep_truncation && !any4(s.tau[k].v != X{}); }
     inline void row(int k, V* h) const {
-        for (int i = 0; i < n; i++) h[i] = block.load(a.h, static_cast<std::ptrdiff_t>(k) * n + i);
+        const std::ptrdiff_t at = static_cast<std::ptrdiff_t>(k) * n;
+        if (a.h.member == 0)
+            for (int i = 0; i < n; i++) h[i] = V(a.h.data[at + i]);
+        else
+            for (int i = 0; i < n; i++) h[i] = block.load(a.h, at + i);
+    }
+    // which rows are residuals of one state
+    void axes() {
+        for (int k = 0; k < a.rows; k++) {
+            int found = -1, others = a.h.member != 0;
+            const double* h = a.h.data + static_cast<std::ptrdiff_t>(k) * n;
+            for (int i = 0; i < n; i++) {
+                if (h[i] == 1.0) found = i;
+                else others += h[i] != 0.0;
+            }
+            for (int i = 0; i < n; i++) others += h[i] == 1.0 && i != found;
+            s.axis[k] = static_cast<signed char>(others ? -1 : found);
+        }
     }
     inline V target(int k) const { return block.load(a.y, k); }
 
-    // log of the integral of exp(nu z - tau z^2 / 2) under N(mu, v)
-    static inline V integral(const V& tau, const V& nu, const V& mu, const V& v) {
-        const V f = V(1.0) + tau * v;
-        return V(0.5) * ((nu * nu * v + V(2.0) * nu * mu - tau * mu * mu) / f - log_of(f));
+    // log of the integral of exp(nu z - tau z^2 / 2) under N(mu, v) is half of this less log f, f = 1 + tau v
+    static inline V integral(const V& tau, const V& nu, const V& mu, const V& v, const V& over_f) {
+        return (nu * nu * v + V(2.0) * nu * mu - tau * mu * mu) * over_f;
     }
 
     // moments (mean, var) of the belief against those that its factor asks for; over = 1 / var of the factor
@@ -347,7 +398,15 @@ struct Ep {
     }
 
     // residual z, its variance v and covariance Ph with x_t, of row k in a belief
-    inline void project(int k, const V* h, const V* ms, const V* Ps, V* Ph, V* z, V* v) const {
+    inline void project(int k, const V* ms, const V* Ps, V* Ph, V* z, V* v) const {
+        if (const int i = s.axis[k]; i >= 0) {
+            *z = ms[i] - target(k);
+            *v = Ps[i * n + i];
+            for (int j = 0; j < n; j++) Ph[j] = Ps[i * n + j];
+            return;
+        }
+        V h[cap];
+        row(k, h);
         *z = -target(k);
         *v = V(0.0);
         for (int i = 0; i < n; i++) {
@@ -359,6 +418,15 @@ struct Ep {
         }
     }
 
+    // what a site on a residual of covariance Ph with the state makes of its belief ms, Ps
+    inline void turn_by(const V* Ph, const V& shift, const V& shrink, V* ms, V* Ps) const {
+        for (int i = 0; i < n; i++) {
+            ms[i] += Ph[i] * shift;
+            const V g = Ph[i] * shrink;
+            for (int j = 0; j <= i; j++) Ps[j * n + i] = Ps[i * n + j] -= g * Ph[j];
+        }
+    }
+
     // renew (or, for the evidence, look at) the rows of stage t given the belief ms, Ps about x_t; fold each into the
     // filtered mf, Pf. Rows are renewed `abreast` at a time from one belief, so that their moments do not wait for each
     // other, unless they have two explanations.
@@ -367,54 +435,110 @@ struct Ep {
         for (int first = a.start[t], last; first < a.start[t + 1]; first = last) {
             last = first + 1;
             while (single(first) && last < a.start[t + 1] && last - first < abreast && single(last)) last++;
-            V h[abreast][cap], dt[abreast] = {}, dn[abreast] = {};
-            bool says[abreast];
+            V Ph[abreast][cap], z[abreast], v[abreast];
+            Cavity<X> cavity[abreast];
+            int says[abreast], count = 0;
             for (int k = first; k < last; k++) {
-                const int c = k - first;
-                row(k, h[c]);
-                says[c] = false;
                 if constexpr (!renew) {
                     f.top += densest(k);
+                    if (bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
                     if (kind(k) == noise_gaussian) {
-                        f.log_z -= V(0.5) * (V(log_2pi) + log_of(variance(k)));
-                        if (a.group_R || a.mix) gaussian_slopes(k, h[c], ms, Ps, f);
-                        if (bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
+                        f.log_z -= V(0.5 * log_2pi);
+                        f.below.add(variance(k));
+                        if (a.group_R || a.mix) gaussian_slopes(k, ms, Ps, f);
                     }
                 }
                 if (kind(k) == noise_gaussian) continue;
-                V Ph[cap], z, v;
-                project(k, h[c], ms, Ps, Ph, &z, &v);
-                if (silent(k) && far_inside(k, z, v)) {
-                    if (!renew && bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
-                    continue;
-                }
-                says[c] = true;
-                if constexpr (renew) propose(k, z, v, dt + c, dn + c, f, damping);
-                else look_at(t, k, z, v, f);
+                project(k, ms, Ps, Ph[count], z + count, v + count);
+                if (silent(k) && far_inside(k, z[count], v[count])) continue;
+                cavity[count] = cavity_of(k, z[count], larger(v[count], V(1e-300)));
+                if constexpr (!renew) look_at(t, k, z[count], v[count], cavity[count], f);
+                says[count++] = k;
             }
-            for (int k = first; k < last; k++) {
-                const int c = k - first;
-                if (renew && says[c]) {
-                    V Ph[cap], z, v;
-                    project(k, h[c], ms, Ps, Ph, &z, &v);
-                    const V gain = V(1.0) / larger(V(1.0) + dt[c] * v, V(1e-12));
-                    s.tau[k] += dt[c];
-                    s.nu[k] += dn[c];
-                    const V shift = (dn[c] - dt[c] * z) * gain, shrink = dt[c] * gain;
-                    for (int i = 0; i < n; i++) {
-                        ms[i] += Ph[i] * shift;
-                        const V g = Ph[i] * shrink;
-                        for (int j = 0; j < n; j++) Ps[i * n + j] -= g * Ph[j];
+            if constexpr (renew) {
+                if (count > 0) {
+                    V dt[abreast], dn[abreast], mean[abreast], var[abreast];
+                    tilt(count, says, cavity, mean, var);
+                    for (int c = 0; c < count; c++) propose(says[c], z[c], v[c], cavity[c], mean[c], var[c], dt + c, dn + c, f, damping);
+                    for (int c = 0; c < count; c++) {
+                        if (c > 0) project(says[c], ms, Ps, Ph[c], z + c, v + c);
+                        const V gain = over(larger(V(1.0) + dt[c] * v[c], V(1e-12)));
+                        s.tau[says[c]] += dt[c];
+                        s.nu[says[c]] += dn[c];
+                        turn_by(Ph[c], (dn[c] - dt[c] * z[c]) * gain, dt[c] * gain, ms, Ps);
                     }
                 }
-                if (says[c] || kind(k) == noise_gaussian) fold<renew>(k, h[c], mf, Pf, f);
+            }
+            for (int c = 0; c < count; c++) fold<renew>(says[c], mf, Pf, f);
+            for (int k = first; k < last; k++)
+                if (kind(k) == noise_gaussian) fold<renew>(k, mf, Pf, f);
+        }
+    }
+    // Tilted moments of some rows: of one member those of all boxes at a time, a row a lane.
+    inline void tilt(int count, const int* says, const Cavity<X>* cavity, V* mean, V* var) const {
+        bool boxes = lone;
+        for (int c = 0; c < count; c++) boxes = boxes && boxed(says[c]);
+        if (boxes) {
+            X lo, hi;
+            edges(says[0], &lo, &hi);
+            for (int c = 1; c < count; c++) {
+                X low, high;
+                edges(says[c], &low, &high);
+                lo = at_lane(c, low, lo);
+                hi = at_lane(c, high, hi);
+            }
+            spread_lanes(cut4<moments>(abreast_of(cavity, count), lo, hi), count, mean, var);
+            return;
+        }
+        for (int c = 0; c < count; c++) {
+            const int k = says[c];
+            if (boxed(k)) {
+                X lo, hi;
+                edges(k, &lo, &hi);
+                const Truncated<X> q = cut4<moments>(cavity[c], lo, hi);
+                mean[c] = of(q.mean);
+                var[c] = of(q.var);
+            } else {
+                const Tilted<X> q = tilted<moments>(k, cavity[c]);
+                mean[c] = of(q.mean);
+                var[c] = of(q.var);
             }
         }
     }
+    inline bool boxed(int k) const { return kind(k) == noise_uniform || kind(k) == ep_truncation; }
+    static inline void spread_lanes(const Truncated<X>& q, int count, V* mean, V* var) {
+        for (int c = 0; c < count; c++) {
+            mean[c] = V(q.mean[c]);
+            var[c] = V(q.var[c]);
+        }
+    }
+    inline void edges(int k, X* lo, X* hi) const {
+        if (kind(k) == noise_uniform) {
+            *hi = s.s[a.group[k]].v;
+            *lo = -*hi;
+        } else {
+            *lo = all<X>(a.lo[k]);
+            *hi = all<X>(a.hi[k]);
+        }
+    }
+    // lane c of `here`, the others of `there`
+    static inline X at_lane(int c, const X& here, const X& there) {
+        typedef decltype(X{} < X{}) Whole;
+        static const Whole lane[abreast] = {Whole{-1}, Whole{0, -1}, Whole{0, 0, -1}};
+        return lane[c] ? here : there;
+    }
+    // a few cavities of one member, one a lane
+    static inline Cavity<X> abreast_of(const Cavity<X>* each, int count) {
+        Cavity<X> one = each[0];
+        for (int c = 1; c < count; c++)
+            one = {at_lane(c, each[c].mu, one.mu), at_lane(c, each[c].c, one.c), at_lane(c, each[c].sd, one.sd),
+                   at_lane(c, each[c].scale, one.scale)};
+        return one;
+    }
     // d log Z / d log R = ((z^2 + v) / R - 1) / 2 of a Gaussian row whose residual has the posterior N(z, v)
-    inline void gaussian_slopes(int k, const V* h, const V* ms, const V* Ps, EpFound& f) const {
+    inline void gaussian_slopes(int k, const V* ms, const V* Ps, EpFound& f) const {
         V Ph[cap], z, v;
-        project(k, h, ms, Ps, Ph, &z, &v);
+        project(k, ms, Ps, Ph, &z, &v);
         Tilted<X> q{};
         const V R = variance(k);
         q.slope_R = (V(0.5) * ((z * z + v) / R - V(1.0))).v;
@@ -428,35 +552,34 @@ struct Ep {
 
     // the cavity of row k; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
     inline Cavity<X> cavity_of(int k, const V& z, const V& v) const {
-        const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9)), over_open = V(1.0) / open;
-        const V c = smaller(v * over_open, V(1e300)), mu = (z - v * s.nu[k]) * over_open, scale = root(open / v);
+        const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9)), over_open = over(open);
+        const V c = smaller(v * over_open, V(1e300)), mu = (z - v * s.nu[k]) * over_open, scale = root(open * over(v));
         return {mu.v, c.v, (c * scale).v, scale.v};
     }
 
     // the change of row k's site that reproduces its moments
-    inline void propose(int k, const V& z, const V& spread, V* dt, V* dn, EpFound& f, double damping) const {
-        const V v = larger(spread, V(1e-300));
-        const Cavity<X> cavity = cavity_of(k, z, v);
-        const V scale = of(cavity.scale), w = scale * scale;
-        const Tilted<X> q = tilted<moments>(k, cavity);
-        const V tv = larger(of(q.var), V(1e-300)), tm = of(q.mean), over = V(1.0) / tv;
-        note(f, z, v, tm, tv, over, cavity);
+    inline void propose(int k, const V& z, const V& spread, const Cavity<X>& cavity, const V& mean, const V& var,
+                        V* dt, V* dn, EpFound& f, double damping) const {
+        const V v = larger(spread, V(1e-300)), scale = of(cavity.scale), w = scale * scale;
+        const V tv = larger(var, V(1e-300)), over_tv = over(tv);
+        note(f, z, v, mean, tv, over_tv, cavity);
         // else the factor widens the belief: nothing for now
         const auto says = tv.v < cavity.c * (1.0 - (kind(k) == ep_truncation ? faint : 1e-13));
-        const V tau = either(says, over - w, V(0.0)), nu = either(says, tm * over - of(cavity.mu) * w, V(0.0));
+        const V tau = either(says, over_tv - w, V(0.0)), nu = either(says, mean * over_tv - of(cavity.mu) * w, V(0.0));
         // by what the site changes: a site that stays leaves the belief as it is, whatever rounding made of v
         const V step(single(k) ? 1.0 : damping);
         *dt = step * (tau - s.tau[k]);
         *dn = step * (nu - s.nu[k]);
     }
 
-    inline void look_at(int t, int k, const V& z, const V& spread, EpFound& f) {
+    inline void look_at(int t, int k, const V& z, const V& spread, const Cavity<X>& cavity, EpFound& f) {
         const V v = larger(spread, V(1e-300));
-        const Cavity<X> cavity = cavity_of(k, z, v);
         const Tilted<X> q = bent(t) ? tilted<cumulants>(k, cavity) : tilted<evidence>(k, cavity);
         const V tv = larger(of(q.var), V(1e-300));
-        note(f, z, v, of(q.mean), tv, V(1.0) / tv, cavity);
-        f.log_z += of(q.log_z) - integral(s.tau[k], s.nu[k], of(cavity.mu), of(cavity.c));
+        note(f, z, v, of(q.mean), tv, over(tv), cavity);
+        const V left = V(1.0) + s.tau[k] * of(cavity.c);
+        f.log_z += of(q.log_z) - V(0.5) * integral(s.tau[k], s.nu[k], of(cavity.mu), of(cavity.c), over(left));
+        f.above.add(left);
         f.worst = smaller(f.worst, of(q.log_z) + unit(k));
         slopes(k, q, v, f);
         if (bent(t)) ratios(q, v, cross.r3 + k, cross.r4 + k);
@@ -468,30 +591,26 @@ struct Ep {
 
     // site of row k into the filtered moments mf, Pf
     template <bool renew>
-    inline void fold(int k, const V* h, V* mf, V* Pf, EpFound& f) {
+    inline void fold(int k, V* mf, V* Pf, EpFound& f) {
         V Ph[cap], z, v;
-        project(k, h, mf, Pf, Ph, &z, &v);
-        const V tau = s.tau[k], gain = V(1.0) / (V(1.0) + tau * v);
-        if constexpr (!renew) f.log_z += integral(tau, s.nu[k], z, v);
-        const V shift = (s.nu[k] - tau * z) * gain, shrink = tau * gain;
-        for (int i = 0; i < n; i++) {
-            mf[i] += Ph[i] * shift;
-            const V g = Ph[i] * shrink;
-            for (int j = 0; j < n; j++) Pf[i * n + j] -= g * Ph[j];
+        project(k, mf, Pf, Ph, &z, &v);
+        const V tau = s.tau[k], left = V(1.0) + tau * v, gain = over(left);
+        if constexpr (!renew) {
+            f.log_z += V(0.5) * integral(tau, s.nu[k], z, v, gain);
+            f.below.add(left);
         }
+        turn_by(Ph, (s.nu[k] - tau * z) * gain, tau * gain, mf, Pf);
     }
 
     // log of the width of a row's box: with it the log of a density becomes that of a share
-    inline V unit(int k) const {
-        return kind(k) != ep_truncation && a.group[k] >= 0 ? log_of(V(2.0) * s.s[a.group[k]] + V(1e-300)) : V(0.0);
-    }
+    inline V unit(int k) const { return kind(k) != ep_truncation && a.group[k] >= 0 ? s.log_box[a.group[k]] : V(0.0); }
 
     // log of the largest density of a row's noise
     inline V densest(int k) const {
         if (kind(k) == ep_truncation) return V(0.0);
-        const V half = a.group[k] >= 0 ? s.s[a.group[k]] : V(0.0), R = variance(k);
-        const V box = -log_of(V(2.0) * half + V(1e-300)), bell = V(-0.5) * log_of(V(6.283185307179586) * R + V(1e-300));
-        const V most = smaller(box, bell);
+        const V box = a.group[k] >= 0 ? -s.log_box[a.group[k]] : V(690.0);
+        if (kind(k) == noise_uniform && !a.mix) return smaller(box, V(345.0));
+        const V bell = V(-0.5) * log_of(V(6.283185307179586) * variance(k) + V(1e-300)), most = smaller(box, bell);
         return kind(k) == noise_maybe_lost ? larger(most, V(a.lost[k])) : most;
     }
 
@@ -556,10 +675,7 @@ struct Ep {
             pack(Pp, s.Pp + t * packed());
             for (int i = 0; i < n * n; i++) Pf[i] = Pp[i];
             for (int k = a.start[t]; k < a.start[t + 1]; k++) {
-                if (silent(k)) continue;
-                V h[cap];
-                row(k, h);
-                fold<true>(k, h, mf, Pf, none);
+                if (!silent(k)) fold<true>(k, mf, Pf, none);
             }
         }
     }
@@ -602,7 +718,7 @@ struct Ep {
             if (a.start[t] < a.start[t + 1] || !renew) {
                 V Lambda[cap * cap], eta[cap], L[cap * cap], ms[cap], Ps[cap * cap];
                 ahead(t, Lambda, eta);
-                ep_root(n, Pp, L);
+                ep_parts(n, Pp, L);
                 ep_join(n, L, Lambda, Ps);
                 for (int i = 0; i < n; i++)
                     for (int j = 0; j < n; j++) eta[i] -= Lambda[i * n + j] * mp[j];
@@ -643,14 +759,17 @@ struct Ep {
             }
             ahead(t, Lambda, eta);
             unpack(s.Pp + t * packed(), Pp);
-            ep_root(n, Lambda, U);
+            ep_parts(n, Lambda, U);
             ep_join(n, U, Pp, W);
             for (int i = 0; i < n; i++) {
                 gap[i] = eta[i];
                 for (int j = 0; j < n; j++) gap[i] -= Lambda[i * n + j] * s.mp[t * n + j];
             }
             less(W, Pp, gap, r);
-            if (!renew && bent(t)) covariances(t, A, G, W, Pp);
+            if (!renew && bent(t)) {
+                covariances(t, A, G, W, Pp);
+                inverse(cross.S + t * n * n, cross.Pf + t * n * n);
+            }
             if (t > 0 && a.G.data) turn(G, W, r);
             const V before = f.residual;
             if (renew) f.residual = V(0.0);
@@ -704,7 +823,7 @@ struct Ep {
             block.loads(a.A, t - 1, n * n, A);
             if (a.G.data) block.loads(a.G, t - 1, n * n, G);
             ahead(t, Lambda, eta);
-            ep_root(n, Lambda, U);
+            ep_parts(n, Lambda, U);
             pass_on(t, A, G, Lambda, eta, U);
         }
     }
@@ -768,16 +887,23 @@ struct Ep {
     // Rows with two explanations are left out: theirs is no small correction.
     V second() const {
         V total(0.0), R[shape_reach][cap * cap], C[shape_reach][cap * cap];
+        for (int k = 0; k < a.rows; k++)
+            s.bends[k] = kind(k) != noise_gaussian && single(k) && any4((cross.r3[k].v != X{}) | (cross.r4[k].v != X{}));
         for (int t = 0; t <= a.T; t++) {
             V M[cap * cap], W[cap * cap], h[cap];
             int last = 0;
             for (int l = 1; l <= shape_reach && t + l <= a.T; l++) {
                 const int u = t + l;
-                if (l > 1) gain(R[l - 2], u - 1, M);
-                else
-                    for (int i = 0; i < n * n; i++) M[i] = V(i % (n + 1) == 0 ? 1.0 : 0.0);
-                product(M, cross.X0 + u * n * n, C[l - 1]);
-                product(M, cross.B + u * n * n, R[l - 1]);
+                if (l > 1) {
+                    gain(R[l - 2], u - 1, M);
+                    product(M, cross.X0 + u * n * n, C[l - 1]);
+                    product(M, cross.B + u * n * n, R[l - 1]);
+                } else {
+                    for (int i = 0; i < n * n; i++) {
+                        C[0][i] = cross.X0[u * n * n + i];
+                        R[0][i] = cross.B[u * n * n + i];
+                    }
+                }
                 last = l;
             }
             const V *S = cross.S + t * n * n, *X1 = cross.X1 + t * n * n;
@@ -792,7 +918,7 @@ struct Ep {
                 later(t, last, W + i * n, w3, w4, C, R, total);
             }
             for (int k = a.start[t]; k < a.start[t + 1]; k++) {
-                if (!bends(k)) continue;
+                if (!s.bends[k]) continue;
                 V Sh[cap];
                 row(k, h);
                 for (int i = 0; i < n; i++) {
@@ -805,7 +931,6 @@ struct Ep {
         }
         return total;
     }
-    inline bool bends(int k) const { return kind(k) != noise_gaussian && (kind(k) < noise_contaminated || kind(k) == ep_truncation); }
     inline void pair(const V& c, const V& a3, const V& a4, const V& b3, const V& b4, V& total) const {
         const V cube = c * c * c;
         total += cube * (a3 * b3 * V(1.0 / 6.0) + c * a4 * b4 * V(1.0 / 24.0));
@@ -813,7 +938,11 @@ struct Ep {
     // with the rows of stage t from k on, given the covariance with x_t
     inline void with_rows(int t, int k, const V* cov, const V& a3, const V& a4, V& total) const {
         for (; k < a.start[t + 1]; k++) {
-            if (!bends(k)) continue;
+            if (!s.bends[k]) continue;
+            if (s.axis[k] >= 0) {
+                pair(cov[s.axis[k]], a3, a4, cross.r3[k], cross.r4[k], total);
+                continue;
+            }
             V h[cap], c(0.0);
             row(k, h);
             for (int j = 0; j < n; j++) c += cov[j] * h[j];
@@ -923,15 +1052,15 @@ struct Ep {
             }
     }
     // M = R S_v^-1
-    inline void gain(const V* R, int v, V* M) const {
+    inline void gain(const V* R, int v, V* M) const { product(R, cross.Pf + v * n * n, M); }
+    // out (n,n) = S^-1, symmetric
+    inline void inverse(const V* S, V* out) const {
         V L[cap * cap], work[cap];
-        for (int i = 0; i < n * n; i++) {
-            L[i] = cross.S[v * n * n + i];
-            M[i] = R[i];
-        }
+        for (int i = 0; i < n * n; i++) L[i] = S[i];
         unit_factor(n, L, 1e-12, work);
         for (int i = 0; i < n; i++) {
-            V* b = M + i * n;
+            V* b = out + i * n;
+            for (int j = 0; j < n; j++) b[j] = V(i == j ? 1.0 : 0.0);
             unit_lower(n, L, b);
             for (int j = 0; j < n; j++) b[j] = b[j] * L[j * n + j];
             unit_upper(n, L, b);
@@ -939,7 +1068,7 @@ struct Ep {
     }
 
     static inline void ratios(const Tilted<X>& q, const V& v, V* out3, V* out4) {
-        const V w = V(1.0) / larger(v, V(1e-60));
+        const V w = over(larger(v, V(1e-60)));
         *out3 = of(q.k3) * w * w * w;
         *out4 = of(q.k4) * w * w * w * w;
     }
@@ -987,61 +1116,80 @@ struct Ep {
         V *m = s.m + t * n, *D = s.D + t * n;
         for (int first = 0; first < n; first += abreast) {
             const int last = first + abreast < n ? first + abreast : int(n);
-            V dD[abreast] = {}, dm[abreast] = {};
+            V half[abreast], told[abreast];
+            Cavity<X> cavity[abreast];
+            int at[abreast], count = 0;
             for (int i = first; i < last; i++) {
-                if constexpr (!renew)
+                if constexpr (!renew) {
                     if (t > 0 && fitted(i)) {  // g_i has the posterior mean p r_i and variance p - p W_ii p
                         const V p = power(i), share = p * W[i * n + i];
                         f.slope[a.group_Q[i]] += p * r[i] * r[i] - share;
                         f.learned[a.group_Q[i]] += share * share;
                     }
-                if (!has_site(t, i)) {
-                    if (!renew && bent(t)) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
-                    continue;
+                    if (bent(t)) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
                 }
-                const V half = larger(width(t, i), V(1e-150)), square = half * half;
+                if (!has_site(t, i)) continue;
+                const V width_i = larger(width(t, i), V(1e-150)), square = width_i * width_i;
                 V know = W[i * n + i];
                 if (any4(know.v * square.v < all<X>(1e-8))) know = larger(know, V(1e-8) / square);  // nothing known: a wide cavity
-                const V over_know = V(1.0) / know, told = D[i] * know, open = larger(V(1.0) - told, V(1e-12) * told);
-                const V c = open * over_know, mu = m[i] + r[i] * over_know, w = know / open, scale = root(w);
-                const Cavity<X> cavity{mu.v, c.v, (c * scale).v, scale.v};
-                const V mean = m[i] + D[i] * r[i], var = D[i] * (V(1.0) - told);
-                if constexpr (renew) {
-                    const Tilted<X> q = uniform4<moments>(cavity, half.v);
-                    const V tv = of(q.var), tm = of(q.mean);
-                    note(f, mean, var, tm, larger(tv, V(1e-300)), V(1.0) / larger(tv, V(1e-300)), cavity);
-                    const V rest = larger(V(1.0) - tv * w, V(1e-6));  // 1 - tilted variance over the cavity's
-                    const V over = V(1.0) / rest;
-                    dD[i - first] = tv * over - D[i];
-                    dm[i - first] = mu + (tm - mu) * over - m[i];
+                const V over_know = over(know), share = D[i] * know;
+                const V open = larger(V(1.0) - share, V(1e-12) * share);
+                const V c = open * over_know, mu = m[i] + r[i] * over_know, scale = root(know * over(open));
+                cavity[count] = {mu.v, c.v, (c * scale).v, scale.v};
+                half[count] = width_i;
+                told[count] = share;
+                at[count++] = i;
+            }
+            if (count == 0) continue;
+            if constexpr (renew) {
+                V mean[abreast], var[abreast], dD[abreast], dm[abreast];
+                if (lone) {
+                    X box = half[0].v;
+                    for (int c = 1; c < count; c++) box = at_lane(c, half[c].v, box);
+                    spread_lanes(cut4<moments>(abreast_of(cavity, count), -box, box), count, mean, var);
                 } else {
-                    const Tilted<X> q = bent(t) ? uniform4<cumulants>(cavity, half.v) : uniform4<evidence>(cavity, half.v);
-                    const V tv = larger(of(q.var), V(1e-300));
-                    note(f, mean, var, of(q.mean), tv, V(1.0) / tv, cavity);
-                    const V spread = D[i] + c, d = m[i] - mu;
-                    f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + log_of(spread) + d * d / spread);
-                    f.worst = smaller(f.worst, of(q.log_z) + log_of(V(2.0) * half));
+                    for (int c = 0; c < count; c++) {
+                        const Truncated<X> q = cut4<moments>(cavity[c], -half[c].v, half[c].v);
+                        mean[c] = of(q.mean);
+                        var[c] = of(q.var);
+                    }
+                }
+                for (int c = 0; c < count; c++) {
+                    const int i = at[c];
+                    const V tv = var[c], tm = mean[c], mu = of(cavity[c].mu), scale = of(cavity[c].scale);
+                    const V floored = larger(tv, V(1e-300));
+                    note(f, m[i] + D[i] * r[i], D[i] * (V(1.0) - told[c]), tm, floored, over(floored), cavity[c]);
+                    // 1 - tilted variance over the cavity's
+                    const V wider = over(larger(V(1.0) - tv * scale * scale, V(1e-6)));
+                    dD[c] = tv * wider - D[i];
+                    dm[c] = mu + (tm - mu) * wider - m[i];
+                }
+                for (int c = 0; c < count; c++) {
+                    const int i = at[c];
+                    const V gain = over(larger(V(1.0) + dD[c] * W[i * n + i], V(1e-12)));
+                    V column[cap];
+                    for (int j = 0; j < n; j++) column[j] = W[i * n + j];
+                    turn_by(column, -(r[i] * dD[c] + dm[c]) * gain, dD[c] * gain, r, W);
+                    D[i] += dD[c];
+                    m[i] += dm[c];
+                }
+            } else {
+                for (int c = 0; c < count; c++) {
+                    const int i = at[c];
+                    const Tilted<X> q = bent(t) ? uniform4<cumulants>(cavity[c], half[c].v) : uniform4<evidence>(cavity[c], half[c].v);
+                    const V tv = larger(of(q.var), V(1e-300)), var = D[i] * (V(1.0) - told[c]);
+                    note(f, m[i] + D[i] * r[i], var, of(q.mean), tv, over(tv), cavity[c]);
+                    const V spread = D[i] + of(cavity[c].c), d = m[i] - of(cavity[c].mu);
+                    f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + d * d * over(spread));
+                    f.above.add(spread);
+                    f.worst = smaller(f.worst, of(q.log_z) + (t > 0 ? s.log_box[a.group_w[i]] : log_of(V(2.0) * half[c])));
                     if (t > 0) {
-                        const V share = larger(V(1.0) - V(3.0) * var / square, V(0.0));
+                        const V share = larger(V(1.0) - V(3.0) * var / (half[c] * half[c]), V(0.0));
                         f.slope[a.group_w[i]] += of(q.slope_s);
                         f.learned[a.group_w[i]] += share * share;
                     }
                     if (bent(t)) ratios(q, var, cross.w3 + t * n + i, cross.w4 + t * n + i);
                 }
-            }
-            for (int i = first; renew && i < last; i++) {
-                if (!has_site(t, i)) continue;
-                const V gain = V(1.0) / larger(V(1.0) + dD[i - first] * W[i * n + i], V(1e-12));
-                const V shift = (r[i] * dD[i - first] + dm[i - first]) * gain, shrink = dD[i - first] * gain;
-                V column[cap];
-                for (int j = 0; j < n; j++) column[j] = W[j * n + i];
-                for (int j = 0; j < n; j++) {
-                    r[j] -= column[j] * shift;
-                    const V g = column[j] * shrink;
-                    for (int k = 0; k < n; k++) W[j * n + k] -= g * column[k];
-                }
-                D[i] += dD[i - first];
-                m[i] += dm[i - first];
             }
         }
     }
@@ -1064,6 +1212,8 @@ struct Ep {
         f.far = V(0.0);
         f.log_z = V(0.0);
         f.worst = V(1e300);
+        f.above.clear();
+        f.below.clear();
         for (int g = 0; g <= a.groups; g++) f.slope[g] = V(0.0);
         for (int g = 0; g < a.groups; g++) f.learned[g] = V(0.0);
     }
@@ -1152,8 +1302,10 @@ struct Ep {
     // Evidence, its slopes and the belief of the sites as they are; both halves without renewing anything.
     void look(EpFound& f) {
         clear(f);
+        for (int g = 0; g < a.groups; g++) s.log_box[g] = log_of(V(2.0) * s.s[g] + V(1e-300));
         forward<false>(f, 1.0);
         backward<false>(f, a.T);
+        f.log_z += V(0.5) * (f.above.value() - f.below.value());
         f.residual = root(f.residual);
     }
     static inline bool sound(const EpFound& f, int l) {

@@ -31,6 +31,7 @@ constexpr double ep_lean = 4.0;  // points that a first guess of their covarianc
 constexpr double ep_wide = 1.15;  // by how much a stage reaches farther than the posterior is thought to
 constexpr double ep_some = 10.0;  // effective points without which the evidence itself is in doubt
 constexpr int ep_few = 2;     // rows that may come or go while the mode stays
+constexpr double ep_sure = 0.25;  // standard deviations in which a step of Newton errs by no more than the mode may
 constexpr double ep_apart = 1.0;  // disagreement of moments, in standard deviations, beyond which no step is taken
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
@@ -404,8 +405,32 @@ struct EpLearner {
         return q == 0 || wide < a.narrow || a.nodes == 1;
     }
 
-    // climb from phi to the mode; H at the end; returns 0, 1: not converged, 2: no sound point
-    int climb(double* phi, double (*H)[ep_free], double* best, bool warm) {
+    // a step d from phi of slope g to the mode, by the quadratic that led to it; the kept sites follow
+    void go(double* phi, const double* d, const double* g, double* best) {
+        const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
+        for (int j = 0; j < q; j++) {
+            const double told_slope = group[j] >= 0 ? 2.0 * a.reference * (1.0 - told(j, 0)) : 0.0;
+            *a.log_prior += (prior_slope(j, phi) + told_slope) * d[j];
+            *best += 0.5 * g[j] * d[j];
+        }
+        for (std::ptrdiff_t site = 0; site < sites; site++) {
+            const std::ptrdiff_t k = site - stages;
+            double &own = k < 0 ? keep_D[site] : keep_tau[k], &first = k < 0 ? keep_m[site] : keep_nu[k], turn = 0.0, move = 0.0;
+            if (!(own > 0.0) || (k >= 0 && a.base.kind[k] == noise_gaussian)) continue;
+            for (int j = 0; j < q; j++) {
+                turn += lead[2 * site * q + j] * d[j];
+                move += lead[(2 * site + 1) * q + j] * d[j];
+            }
+            const double mean = (k < 0 ? first : first / own) + move;
+            own *= std::exp(k < 0 ? -turn : turn);
+            first = k < 0 ? mean : own * mean;
+        }
+        for (int j = 0; j < q; j++) kept[j] = phi[j] += d[j];
+    }
+
+    // climb from phi to the mode, whose last step of at most `sure` is not looked back from; H at the end; returns 0, 1: not
+    // converged, 2: no sound point
+    int climb(double* phi, double (*H)[ep_free], double* best, bool warm, double sure) {
         double column[ep_free][ep_free] = {}, g[ep_free] = {};
         bool measured[ep_free] = {};
         for (int j = 0; j < q; j++) {
@@ -481,7 +506,12 @@ struct EpLearner {
             follow(along, h, value);
             hessian(column, H);
             length = step(H, phi, g, d);
-            if (length < (alone(H) ? min2(a.close, ep_near) : a.close) && missing == 0) return 0;
+            if (missing > 0) continue;
+            if (length < (alone(H) ? min2(a.close, ep_near) : a.close)) return 0;
+            if (length < sure && !alone(H)) {
+                go(phi, d, g, best);
+                return 0;
+            }
         }
         return length < 1.0 ? 0 : 1;
     }
@@ -724,11 +754,11 @@ struct EpLearner {
             // far from the mode the evidence of the bounds alone misleads: first without it
             Ep<N>* const bounds = outside;
             outside = nullptr;
-            code = climb(phi, H, &best, warm);
+            code = climb(phi, H, &best, warm, bounds ? 1.0 : ep_sure);
             if (code == 2) return 2;
             if (bounds) {
                 outside = bounds;
-                code = climb(phi, H, &best, true);
+                code = climb(phi, H, &best, true, ep_sure);
                 if (code == 2) return 2;
             }
         } else {

@@ -37,8 +37,8 @@ void noise_truncated(const TruncatedArgs& a) {
     for (std::size_t k = 0; k < a.size; k += wide_lanes) {
         const Truncated<X> t = truncated4(some(a.mu, k, a.size, 0.0), some(a.c, k, a.size, 1.0),
                                         some(a.lo, k, a.size, -1.0), some(a.hi, k, a.size, 1.0));
-        put(a.log_z, k, a.size, t.log_z);
-        put(a.log_mean, k, a.size, t.log_mean);
+        put(a.log_z, k, a.size, t.log_z());
+        put(a.log_mean, k, a.size, t.log_mean());
         put(a.mean, k, a.size, t.mean);
         put(a.var, k, a.size, t.var);
         put(a.at_lo, k, a.size, t.at_lo);

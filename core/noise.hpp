@@ -25,11 +25,13 @@ namespace HW_ISA {
 
 template <class X>
 struct Truncated {
-    X log_z;         // log of the Gaussian's mass in the box
-    X log_mean;      // log of the Gaussian's mean density in the box; minus infinity for an endless box
+    X log_top;       // log of the standard Gaussian's largest density in the box
+    X mass, dense;   // the Gaussian's mass in the box and its mean density there, over that
     X mean, var;     // tilted
     X at_lo, at_hi;  // tilted density at the ends: -d log Z / d lo, d log Z / d hi
     X k3, k4;        // cumulants
+    inline X log_z() const { return log_top + log4(mass); }
+    inline X log_mean() const { return log_top + log4(dense); }  // minus infinity for an endless box
 };
 typedef Truncated<V4> Truncated4;
 
@@ -69,6 +71,32 @@ inline X polynomial4(const double (&p)[D], X y) {
     return (part[0] + y * part[1]) + y2 * (part[2] + y * part[3]);
 }
 
+// 1 / a and the root of a within an ulp or two. Eight at a time the divider is slow: Newton steps from an estimate of 14 bits.
+template <class X>
+inline X over4(X a) {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(X) == 64) {
+        const X first = X(_mm512_rcp14_pd((__m512d)a)), second = first + first * (1.0 - a * first), e = 1.0 - a * second;
+        return e == e ? second + second * e : first;
+    }
+#endif
+    return 1.0 / a;
+}
+template <class X>
+inline X root4(X a) {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(X) == 64) {
+        const X y = X(_mm512_rsqrt14_pd((__m512d)a));
+        X g = a * y, h = 0.5 * y, e = 0.5 - g * h;
+        g = g + g * e;
+        h = h + h * e;
+        e = 0.5 - g * h;
+        return (a > X{}) & (a < all<X>(1e308)) ? g + g * e : sqrt4(a);
+    }
+#endif
+    return sqrt4(a);
+}
+
 constexpr double tail_0[] = {
     1.92808104715315765, -1.66786659518896005, 1.24154706157386642, -0.78591107554654524,
     0.413644715732683773, -0.17325473408715042, 0.052125502412278802, -0.0075032828206787589,
@@ -100,10 +128,10 @@ struct Tail {
     X i0, i1, i2;
 };
 
-// near: by recurrence, for a <= 4 or where a factor exp(-a^2/2) follows; far: all three to full precision
+// near: by recurrence, for a <= 4 or where a factor exp(-a^2/2) follows; far: all three to full precision. g = 1 / (a + 5)
 template <class X>
-inline Tail<X> tail4(X a, bool far) {
-    const X g = 1.0 / (a + 5.0), y = (a - 5.0) * g;
+inline Tail<X> tail4(X a, X g, bool far) {
+    const X y = (a - 5.0) * g;
     Tail<X> r;
     r.i0 = g * polynomial4(tail_0, y);
     if (far) {
@@ -143,8 +171,11 @@ inline void narrow4(X m, X w, X (&S)[5]) {
 // How much is asked of a factor: mean and variance; evidence and slopes as well; third and fourth cumulant as well.
 enum Depth { moments, evidence, cumulants };
 
-// N(mu, c) cut to [lo, hi]
+// N(mu, c) cut to [lo, hi]. A call within would spill every register: all of it is one body.
 template <int depth, class X>
+#if defined(__GNUC__)
+__attribute__((flatten))
+#endif
 inline Truncated<X> cut4(const Cavity<X>& from, X lo, X hi) {
     constexpr double far = 1e90, half_log_2pi = 0.5 * log_2pi, root_2pi = 2.5066282746310005024;
     const X zero{}, sd = from.sd, scale = from.scale;
@@ -160,10 +191,14 @@ inline Truncated<X> cut4(const Cavity<X>& from, X lo, X hi) {
     const X Ea = exp4(0.5 * (ref - a) * (ref + a)), Eb = exp4(-drop);  // densities at the ends over that at ref
     const auto narrow = drop <= (beyond ? all<X>(0.25) : all<X>(0.03));
 
-    const bool deep = any4((a > all<X>(4.0)) & ~narrow);
-    const Tail<X> A = tail4(abs4(a), deep), B = tail4(b, deep);
+    const bool deep = any4((a > all<X>(4.0)) & ~narrow), thin = any4(narrow);
+    const X near_5 = abs4(a) + 5.0, far_5 = b + 5.0, both = over4(near_5 * far_5);
+    const Tail<X> A = tail4(abs4(a), far_5 * both, deep), B = tail4(b, near_5 * both, deep);
     X Z = beyond ? A.i0 - Eb * B.i0 : root_2pi - Ea * A.i0 - Eb * B.i0;  // over the density at ref
-    const X over = 1.0 / Z, pa = Ea * over, pb = Eb * over;
+    X S[5];
+    const X middle = beyond ? a + 0.5 * w : 0.5 * (a + b);
+    if (thin) narrow4(middle, w, S);
+    const X over = over4(thin ? (narrow ? S[0] : Z) : Z), pa = Ea * over, pb = Eb * over;
     // moments of the distance from the end a (or, inside, from mu), standardised
     const X t1 = beyond ? (A.i1 - Eb * (w * B.i0 + B.i1)) * over : pa - pb;
     const X t2 = beyond ? (A.i2 - Eb * (w * (w * B.i0 + 2.0 * B.i1) + B.i2)) * over : 1.0 + a * pa - b * pb;
@@ -181,20 +216,17 @@ inline Truncated<X> cut4(const Cavity<X>& from, X lo, X hi) {
         r.k4 = from.c * from.c * min4(max4(m4 - 3.0 * v2, -1.2 * v2), 6.0 * v2);
     }
     X density = Z / w;  // mean one, over that at ref
-    if (any4(narrow)) {
-        const X m = beyond ? a + 0.5 * w : 0.5 * (a + b);
-        X S[5];
-        narrow4(m, w, S);
-        const X inverse = 1.0 / S[0], s1 = S[1] * inverse, s2 = S[2] * inverse, w2 = width * width;
+    if (thin) {
+        const X s1 = S[1] * over, s2 = S[2] * over, w2 = width * width;
         const X own = max4(s2 - s1 * s1, zero);
         mean = narrow ? end + sign * width * (0.5 + s1) : mean;
         var = narrow ? w2 * own : var;
         if (depth >= evidence) {
-            density = narrow ? S[0] * exp4(beyond ? -0.5 * w * (a + 0.25 * w) : -0.5 * m * m) : density;
+            density = narrow ? S[0] * exp4(beyond ? -0.5 * w * (a + 0.25 * w) : -0.5 * middle * middle) : density;
             Z = narrow ? w * density : Z;
         }
         if (depth == cumulants) {
-            const X s3 = S[3] * inverse, s4 = S[4] * inverse;
+            const X s3 = S[3] * over, s4 = S[4] * over;
             r.k3 = narrow ? sign * width * w2 * (s3 - 3.0 * s1 * s2 + 2.0 * s1 * s1 * s1) : r.k3;
             r.k4 = narrow ? w2 * w2 * (s4 - 4.0 * s1 * s3 + 6.0 * s1 * s1 * s2 - 3.0 * s1 * s1 * s1 * s1 - 3.0 * own * own)
                           : r.k4;
@@ -203,9 +235,9 @@ inline Truncated<X> cut4(const Cavity<X>& from, X lo, X hi) {
     r.mean = min4(max4(mean, lo), hi);
     r.var = from.c > zero ? var : zero;
     if (depth >= evidence) {
-        const X log_top = -0.5 * ref * ref - half_log_2pi;  // log density at ref, standardised
-        r.log_z = log_top + log4(Z);
-        r.log_mean = log_top + log4(density) + log4(scale);
+        r.log_top = -0.5 * ref * ref - half_log_2pi;
+        r.mass = Z;
+        r.dense = density * scale;
         const X one = scale / max4(Z, all<X>(smallest)), near = Ea * one, away = Eb * one;
         r.at_lo = flip ? away : near;
         r.at_hi = flip ? near : away;
@@ -246,7 +278,7 @@ inline Tilted<X> uniform4(const Cavity<X>& q, X s) {
     r.mean = t.mean;
     r.var = t.var;
     if (depth >= evidence) {
-        r.log_z = t.log_mean;
+        r.log_z = t.log_mean();
         r.slope_s = s > X{} ? s * (t.at_lo + t.at_hi) - 1.0 : X{};
     }
     if (depth == cumulants) {
@@ -267,7 +299,7 @@ inline Tilted<X> uniform_gaussian4(const Cavity<X>& q, X s, X R) {
     r.mean = q.mu + gain * d;
     r.var = gain * (R + gain * t.var);
     if (depth >= evidence) {
-        r.log_z = t.log_mean;
+        r.log_z = t.log_mean();
         r.slope_s = s > X{} ? s * (t.at_lo + t.at_hi) - 1.0 : X{};
         const X e = standardised4(d, sum.scale);
         r.slope_R = 0.5 * (R * over) * (e * e + t.var * over - 1.0);

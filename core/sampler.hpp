@@ -53,7 +53,7 @@ inline double log_mass(const SamplerArgs& a, long j, double cap, double largest)
     if (!(d > 0.0)) return log_exponential(N - a.power, low, high - low);
     const double m = a.prior_mean[j] - N * d * d;
     const Truncated4 t = truncated4(all4(m), all4(d * d), all4(low), all4(high));
-    return t.log_z[0] - N * a.prior_mean[j] + 0.5 * N * N * d * d;
+    return t.log_z()[0] - N * a.prior_mean[j] + 0.5 * N * N * d * d;
 }
 
 // A draw of a standard normal between two ends.

@@ -309,3 +309,16 @@ def test_an_output_gain_is_found_though_none_fits_in_the_middle():
     asked = dataclasses.replace(true, C=[[np.nan], [1.0]], w=UNKNOWN, e=UNKNOWN, theta_bounds=(-2.0, 2.0))
     est = hw.estimate(asked, record, hw.Posterior(nodes=8))
     assert est.theta[0] == pytest.approx(1.0, abs=0.3)
+
+
+@pytest.mark.parametrize("huge", [1e8, 1e12])
+def test_other_records_of_a_model_leave_no_trace(huge):
+    """What records of one model have in common is kept, but not what the size of their outputs made of it."""
+    model = hw.Linear([[1.0]], None, [[1.0]], hw.Gaussian(0.04), hw.Gaussian(0.01), hw.Normal([0.0], [[1.0]]))
+    y = np.cumsum(np.random.default_rng(5).normal(size=(20, 1)), axis=0)
+    first = hw.estimate(model, hw.Record(np.arange(20.0), y), hw.Posterior())
+    fresh = hw.Linear([[1.0]], None, [[1.0]], hw.Gaussian(0.04), hw.Gaussian(0.01), hw.Normal([0.0], [[1.0]]))
+    hw.estimate(fresh, hw.Record(np.arange(20.0), huge * y), hw.Posterior())
+    again = hw.estimate(fresh, hw.Record(np.arange(20.0), y), hw.Posterior())
+    np.testing.assert_array_equal(again.x, first.x)
+    np.testing.assert_array_equal(again.P, first.P)

@@ -11,6 +11,7 @@ half-widths (q, r). Its rows are taken as they are, since nothing can be whitene
 import math
 from dataclasses import dataclass
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,8 @@ class Sites:
         Which entries belong to a noise with unknown variances; `free` says which are.
     row, output : (K,) int arrays
         Row of the record and output of each row of the chain; -1 where it is a bound.
+    gaussian : bool
+        Whether no factor but that of x0 may be bounded.
     """
 
     problem: dict[str, Any]
@@ -65,6 +68,7 @@ class Sites:
     fitted: NDArray[np.bool_]
     row: NDArray[np.intp]
     output: NDArray[np.intp]
+    gaussian: bool
 
     @property
     def guess(self) -> Array:
@@ -85,10 +89,7 @@ class Sites:
     @property
     def exact(self) -> bool:
         """Whether every factor is Gaussian, so that one sweep is the answer."""
-        kind = self.problem["kind"]
-        return bool(
-            (kind == GAUSSIAN).all() and (self.problem["group_w"] < 0).all() and not self.problem["half0"].any()
-        )
+        return self.gaussian and not self.problem["half0"].any()
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +110,8 @@ class Frame:
         As `felt` in `_residuals`.
     R : (ny,) array or None
         Variances of Gaussian outputs; None where the noise has a bounded part.
+    gaussian : bool
+        As in `Sites`.
     """
 
     problem: dict[str, Any]
@@ -125,6 +128,7 @@ class Frame:
     at: NDArray[np.intp]
     felt: Array
     R: Array | None
+    gaussian: bool
 
     def fits(self, scale: Array, y: Array) -> bool:
         """Say whether no variance is so small beside the outputs y (T, ny), of scale (p,), that it is lifted."""
@@ -134,8 +138,16 @@ class Frame:
         return bool((2.0 * _EXACT * size**2 < self.R).all())
 
 
-#: Frames that are kept of one model.
-_FRAMES = 64
+#: Frames that are kept of one model, each of at most so many rows.
+_FRAMES, _SHORT = 64, 512
+_kept: WeakKeyDictionary[Linear, dict[bool, dict[bytes, Frame]]] = WeakKeyDictionary()
+
+
+def frames_of(model: Linear, record: Record, outliers: bool) -> dict[bytes, Frame] | None:
+    """Return what other short records of the same model have left, None for a long one."""
+    if len(record) > _SHORT:
+        return None
+    return _kept.setdefault(model, {}).setdefault(outliers, {})
 
 
 def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict[bytes, Frame] | None = None) -> Sites:
@@ -145,14 +157,14 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
     """
     y = np.where(record.seen, record.y, 0.0)
     kept, frame = b"", None
-    if frames is not None and isinstance(model.x0, Normal):
+    if frames is not None and not _half_open(model.x0):
         kept = record.seen.tobytes()
         frame = frames.get(kept)
     effect = felt(model) if frame is None else frame.felt
     scale = scales(effect, [record.y[record.seen[:, j], j] for j in range(model.ny)])
     if frame is None or not frame.fits(scale, y):
         frame = _frame(model, record, scale, outliers)
-        if frames is not None and kept and _constant(model):
+        if frames is not None and kept and _constant(model) and frame.fits(scale, y):
             if len(frames) >= _FRAMES:
                 del frames[next(iter(frames))]
             frames[kept] = frame
@@ -166,7 +178,24 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
     if fitted.any():
         scale = np.resize(scale, len(fitted))
         floor = np.where(fitted & (floor < cap), np.minimum(np.maximum(floor, _LEAST * scale), cap), floor)
-    return Sites(problem, frame.free, floor, cap, scale, frame.count, frame.uniform, fitted, frame.row, frame.output)
+    return Sites(
+        problem,
+        frame.free,
+        floor,
+        cap,
+        scale,
+        frame.count,
+        frame.uniform,
+        fitted,
+        frame.row,
+        frame.output,
+        frame.gaussian,
+    )
+
+
+def _half_open(x0: Any) -> bool:
+    """Say whether a box has an end without the other: a bound of the first state, which is in the frame."""
+    return isinstance(x0, Box) and bool((np.isfinite(x0.lo) ^ np.isfinite(x0.hi)).any())
 
 
 def _constant(model: Linear) -> bool:
@@ -224,7 +253,7 @@ def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame
     row = stage[order] - 1
     return Frame(
         problem, free, floor, cap, count, uniform, fitted, row, output, B, joined("Y", float, (ny,)),
-        np.maximum(row, 0), felt(model), R,
+        np.maximum(row, 0), felt(model), R, bool((problem["kind"] == GAUSSIAN).all() and (w_group < 0).all()),
     )  # fmt: skip
 
 

@@ -40,7 +40,7 @@ from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
 from halfwidth.methods._carry import HANDED_ON, Carried, Known, Start, condition
 from halfwidth.methods._protocol import typed
-from halfwidth.methods._sites import Frame, Sites, gaussian_part, sites, uniform_part, unknowns
+from halfwidth.methods._sites import Frame, Sites, frames_of, gaussian_part, sites, uniform_part, unknowns
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
@@ -264,7 +264,10 @@ class Posterior:
         """
         if isinstance(start, np.ndarray):
             start = Start(start)
-        problem = sites(model, record, outliers=self.outliers is not False and self.outliers != 0, frames=frames)
+        outliers = self.outliers is not False and self.outliers != 0
+        if frames is None:
+            frames = frames_of(model, record, outliers)
+        problem = sites(model, record, outliers=outliers, frames=frames)
         if start is None and len(record) > 2 * _FIRST and problem.free.any():
             # The first rows alone say where to look.
             cut = {k: v.value[:_FIRST] for k, v in model.matrices.items() if v.value is not None and v.value.ndim == 3}
@@ -283,9 +286,8 @@ class Posterior:
         self, chain: Sites, model: Linear, start: Start | None, drop: int, known: Known | None, shaped: int
     ) -> dict[str, Any]:
         rate, learn_rate, _ = self._rate(model)
-        first = np.where(chain.free, chain.guess, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
-        if start is not None:
-            first = np.where(chain.free, start.s.clip(chain.floor, chain.cap), first)
+        first = chain.guess if start is None else start.s.clip(chain.floor, chain.cap)
+        first = np.where(chain.free, first, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
         q = int(chain.free.sum()) + learn_rate
         limits = dict(_LIMITS)
         limits["condition"] = condition(len(chain.problem["start"]) - 2) if known is None else 0.0  # `known` sees to it
