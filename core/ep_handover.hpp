@@ -6,8 +6,9 @@
 //     precision = -Cov(g - power / s, s) Cov(s)^-1,    pull = E (g - power / s) + precision E s,    g = d log Z / ds,
 //
 // the moments being those of the posterior over s, the weighted nodes, and power_j by regression of g_j on s and 1 / s_j, no
-// less than 0 and no more than leaves a Gaussian that falls. A half-width that is well seen has a power and next to no precision, one that drowns in the others no power: it
-// is felt through its variance, s^2. So what windows tell whose posterior is wide is true where later ones find it.
+// less than 0 and no more than leaves a Gaussian that falls. A half-width that is well seen has a power and next to no
+// precision. One that drowns in other noise has no power: it is felt through its variance, s^2. So what windows tell whose
+// posterior is wide is true where later ones find it.
 // What log Z lacks to second order has no slope of its own: pull gets that of a line through the nodes,
 // Cov(s)^-1 Cov(s, second).
 // State: the forwards message of the sites (`ep_edge`), of which a later window takes the one before its first row.

@@ -10,9 +10,10 @@
 // covariance H^-1, each later one with the weighted moments of all points so far. A point's weight is its evidence over
 // the mixture of all stages' Gaussians (adaptive multiple importance sampling, Cornuet et al. 2012), the answer the points'
 // mixture; no more stages are asked for once their number leaves less than `enough` standard deviations in doubt. The
-// evidence of a point is that of expectation propagation and what that lacks to second order (Ep::second). A half-width that may as well be 0 has an exponential tail in log s and none in a
-// power of s, so the search and the nodes live in u = s^warp (its density has the prior s^(a-warp) in log s, and at its
-// mode the two Hessians differ by du/dphi only). Sites follow phi from point to point, so a point costs few sweeps.
+// evidence of a point is that of expectation propagation and what that lacks to second order (Ep::second). A half-width
+// that may as well be 0 has an exponential tail in log s and none in a power of s, so the search and the nodes live in u =
+// s^warp (its density has the prior s^(a-warp) in log s, and at its mode the two Hessians differ by du/dphi only). Sites
+// follow phi from point to point, so a point costs few sweeps.
 //
 // Bounds as a factor count as an event that small half-widths make likely: within few rows that keeps half-widths from
 // growing until bounds alone shape the path, over hundreds it shrinks them. So Z(phi) is divided by a power, `condition`,
