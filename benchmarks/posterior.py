@@ -475,7 +475,7 @@ def robust():
     print(f"{count} random windows: {bad} with a number that is not finite; statuses {status}")
 
 
-#: Middle of the half-widths' prior in calibration, and its standard deviation over the middle, both of s^(1/2).
+#: Middle of the half-widths' prior in calibration, and its standard deviation over the middle.
 MIDDLE, SPREAD = np.array([0.1, 0.1, 0.1, 0.3, 0.3]), 0.3
 
 
