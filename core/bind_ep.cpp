@@ -2,9 +2,12 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <cstring>
 #include <initializer_list>
+#include <iterator>
 #include <new>
 #include <optional>
 #include <stdexcept>
@@ -45,17 +48,17 @@ struct Work {
     double* p;
 };
 
-// The arrays of a problem, kept alive while the kernel runs.
+// The arrays of a chain, kept alive with it. `of_window` are those that change from window to window.
 class Problem {
   public:
     hw::EpArgs a{};
 
     Problem(const nb::dict& given, std::size_t members) : given_(given) {
-        const In m0 = array("m0"), P0 = array("P0"), half0 = array("half0"), R = array("R");
+        const In R = array("R");
         const InInt group_w = typed<InInt>("group_w"), start = typed<InInt>("start"), group = typed<InInt>("group");
         const InByte kind = typed<InByte>("kind");
-        const std::size_t n = m0.size(), rows = kind.size();
-        want(start.size() >= 2 && n >= 1 && n <= std::size_t(hw::ep_states), "start (T+2,), m0 (n,), n <= 16");
+        const std::size_t n = group_w.size(), rows = kind.size();
+        want(start.size() >= 2 && n >= 1 && n <= std::size_t(hw::ep_states), "start (T+2,), group_w (n,), n <= 16");
         const std::size_t T = start.size() - 2;
         a.T = static_cast<int>(T);
         a.n = static_cast<int>(n);
@@ -63,17 +66,11 @@ class Problem {
         a.groups = nb::cast<int>(given["groups"]);
         a.members = static_cast<int>(members);
         if (T) {
-            a.A = stack("A", 3, n * n, T, members);
+            a.A = stack("A", 3, n * n, T);
             want(a.A.data, "A is missing");
-            a.G = stack("G", 3, n * n, T, members);
-            a.Q = stack("Q", 3, n * n, T, members);
-            a.b = stack("b", 2, n * T, 1, members);
-            want(a.b.data, "b is missing");
+            a.G = stack("G", 3, n * n, T);
+            a.Q = stack("Q", 3, n * n, T);
         }
-        want(P0.size() == n * n && half0.size() == n && group_w.size() == n, "m0, half0, group_w (n,), P0 (n,n)");
-        a.m0 = m0.data();
-        a.P0 = P0.data();
-        a.half0 = half0.data();
         a.group_w = group_w.data();
         for (std::size_t i = 0; i < n; i++) want(a.group_w[i] < a.groups, "group_w out of range");
         if (has("group_Q")) {
@@ -94,9 +91,8 @@ class Problem {
         const In lo = array("lo"), hi = array("hi");
         want(group.size() == rows && R.size() == rows && lo.size() == rows && hi.size() == rows, "one entry a row");
         if (rows) {
-            a.h = stack("h", 2, rows * n, 1, members);
-            a.y = stack("y", 1, rows, 1, members);
-            want(a.h.data && a.y.data, "h, y are missing");
+            a.h = stack("h", 2, rows * n, 1);
+            want(a.h.data, "h is missing");
         }
         a.kind = kind.data();
         a.group = group.data();
@@ -124,6 +120,31 @@ class Problem {
         a.wide = nb::cast<double>(given["wide"]);
     }
 
+    // the same with the data of the dictionary
+    static Problem whole(const nb::dict& given, std::size_t members) {
+        Problem p(given, members);
+        const In m0 = p.array("m0"), P0 = p.array("P0"), half0 = p.array("half0");
+        p.of_window(p.a, m0, P0, half0);
+        if (p.a.T) p.a.b = p.stack("b", 2, std::size_t(p.a.n) * p.a.T, 1);
+        if (p.a.rows) p.a.y = p.stack("y", 1, p.a.rows, 1);
+        want((p.a.b.data || !p.a.T) && (p.a.y.data || !p.a.rows), "b, y are missing");
+        return p;
+    }
+
+    static void of_window(hw::EpArgs& a, const In& m0, const In& P0, const In& half0) {
+        const std::size_t n = a.n;
+        want(m0.size() == n && P0.size() == n * n && half0.size() == n, "m0, half0 (n,), P0 (n,n)");
+        a.m0 = m0.data();
+        a.P0 = P0.data();
+        a.half0 = half0.data();
+    }
+    static void of_window(hw::EpArgs& a, const In& m0, const In& P0, const In& half0, const In& b, const In& y) {
+        of_window(a, m0, P0, half0);
+        want(b.size() == std::size_t(a.T) * a.n && y.size() == std::size_t(a.rows), "b (T,n), y (rows,)");
+        a.b = {b.data(), nullptr, 1, 0};
+        a.y = {y.data(), nullptr, 1, 0};
+    }
+
     // the sites: given ones are copied
     nb::tuple sites(const std::optional<nb::tuple>& from, std::size_t members) {
         const std::size_t stages = a.T + 1, n = a.n, rows = a.rows;
@@ -142,13 +163,12 @@ class Problem {
                               fresh({members, rows}, &a.tau, p[2]), fresh({members, rows}, &a.nu, p[3]));
     }
 
+  private:
     bool has(const char* name) const { return given_.contains(name) && !given_[name].is_none(); }
     In array(const char* name) {
         reals_.push_back(nb::cast<In>(given_[name]));
         return reals_.back();
     }
-
-  private:
     template <class Kind>
     Kind typed(const char* name) {
         Kind k = nb::cast<Kind>(given_[name]);
@@ -156,9 +176,10 @@ class Problem {
         return k;
     }
     // (count, ...) shared by all members, or with one dimension more: (members, count, ...)
-    hw::EpStack stack(const char* name, std::size_t ndim, std::size_t size, std::size_t rows, std::size_t members) {
+    hw::EpStack stack(const char* name, std::size_t ndim, std::size_t size, std::size_t rows) {
         hw::EpStack s{};
         if (!has(name)) return s;
+        const std::size_t members = a.members;
         const In given = array(name);
         s.data = given.data();
         want(given.ndim() == ndim || (given.ndim() == ndim + 1 && given.shape(0) == members), name);
@@ -186,11 +207,137 @@ class Problem {
     std::vector<nb::object> others_;
 };
 
+// Named arrays in one piece of memory, which Python looks at when it asks for one.
+class EpArrays {
+  public:
+    EpArrays() = default;
+    EpArrays(const EpArrays&) = delete;
+    EpArrays& operator=(const EpArrays&) = delete;
+
+    void add(const char* name, std::initializer_list<std::size_t> shape, double** into) {
+        Part part{name, shape.size(), {}, total_, into};
+        std::size_t size = 1, d = 0;
+        for (std::size_t s : shape) size *= part.shape[d++] = s;
+        total_ += size;
+        parts_.push_back(part);
+    }
+    void make() {
+        memory_ = std::vector<double>(total_ + 1);
+        for (Part& part : parts_) *part.into = memory_.data() + part.at;
+    }
+    // the array of this name, kept alive by `self`; none if there is none
+    nb::object get(const char* name, nb::handle self) {
+        for (const Part& part : parts_)
+            if (std::strcmp(part.name, name) == 0)
+                return nb::cast(nb::ndarray<nb::numpy, double>(memory_.data() + part.at, part.ndim, part.shape, self));
+        return nb::object();
+    }
+
+  private:
+    struct Part {
+        const char* name;
+        std::size_t ndim, shape[3], at;
+        double** into;
+    };
+    std::vector<Part> parts_;
+    std::vector<double> memory_;
+    std::size_t total_ = 0;
+};
+
+// What the next window of a stream may take up: sites of the mode and of every lane, and x_t given what lies up to t.
+class EpHanded : public EpArrays {
+  public:
+    EpHanded(const std::int32_t* starts, std::size_t stages, std::size_t n, std::size_t q, std::size_t columns)
+        : start(starts, starts + stages + 1), n(n), q(q), columns(columns) {
+        const std::size_t rows = start.back();
+        add("m", {stages, n}, &m);
+        add("D", {stages, n}, &D);
+        add("tau", {rows}, &tau);
+        add("nu", {rows}, &nu);
+        add("lanes", {2 * (stages * n + rows), columns}, &lanes);
+        add("lane_phi", {columns, q}, &lane_phi);
+        add("mode", {q}, &mode);
+        add("H", {q, q}, &H);
+        add("edge_x", {stages, n}, &edge_x);
+        add("edge_P", {stages, n, n}, &edge_P);
+        make();
+    }
+    std::vector<std::int32_t> start;
+    std::size_t n, q, columns;
+    double *m = nullptr, *D = nullptr, *tau = nullptr, *nu = nullptr, *lanes = nullptr, *lane_phi = nullptr, *mode = nullptr, *H = nullptr;
+    double *edge_x = nullptr, *edge_P = nullptr;
+    double log_mode = 0.0, log_prior = 0.0;
+    int since = 0;
+
+    std::size_t stages() const { return start.size() - 1; }
+};
+
+constexpr const char* handed_names[] = {"m", "D", "tau", "nu", "lanes", "lane_phi", "mode", "H", "edge_x", "edge_P"};
+
+nb::tuple save(nb::handle self) {
+    EpHanded& h = *nb::inst_ptr<EpHanded>(self);
+    nb::list starts, found;
+    for (std::int32_t s : h.start) starts.append(s);
+    for (const char* name : handed_names) found.append(h.get(name, self));
+    return nb::make_tuple(starts, h.n, h.q, h.columns, h.log_mode, h.log_prior, h.since, found);
+}
+
+void load(EpHanded* into, const std::vector<std::int32_t>& start, std::size_t n, std::size_t q, std::size_t columns, double log_mode,
+          double log_prior, int since, const std::vector<In>& arrays) {
+    want(start.size() >= 2 && start.front() == 0 && n >= 1 && arrays.size() == std::size(handed_names), "what `save` returned");
+    for (std::size_t t = 1; t < start.size(); t++) want(start[t - 1] <= start[t], "start must not fall");
+    EpHanded* h = new (into) EpHanded(start.data(), start.size() - 1, n, q, columns);
+    double* to[] = {h->m, h->D, h->tau, h->nu, h->lanes, h->lane_phi, h->mode, h->H, h->edge_x, h->edge_P};
+    const std::size_t stages = h->stages(), rows = start.back();
+    const std::size_t sizes[] = {stages * n, stages * n, rows, rows, 2 * (stages * n + rows) * columns, columns * q, q, q * q, stages * n, stages * n * n};
+    bool fits = true;
+    for (std::size_t k = 0; k < arrays.size(); k++) {
+        fits = fits && arrays[k].size() == sizes[k];
+        if (fits && sizes[k]) std::memcpy(to[k], arrays[k].data(), sizes[k] * sizeof(double));
+    }
+    if (!fits) {
+        h->~EpHanded();
+        throw std::invalid_argument("what `save` returned");
+    }
+    h->log_mode = log_mode;
+    h->log_prior = log_prior;
+    h->since = since;
+}
+
+// What a window found: x, P, k3, k4 of the states; out (rows,); of half-widths mean, sd, lo, hi and `told`: pull, precision and
+// power, one after the other; of nodes phi, log_weight, slope, second; mode and H; numbers.
+class EpFound : public EpArrays {
+  public:
+    int code = 0, nodes = 0, since = 0;
+    long sweeps = 0;
+    bool finite = false, with_rate = false;
+    double rate = 0.0, effective = 0.0, log_evidence = 0.0, log_prior = 0.0, log_mode = 0.0, residual = 0.0;
+};
+
+nb::object item(nb::handle self, const char* name) {
+    EpFound& f = *nb::inst_ptr<EpFound>(self);
+    const auto is = [&](const char* other) { return std::strcmp(name, other) == 0; };
+    if (is("code")) return nb::cast(f.code);
+    if (is("nodes")) return nb::cast(f.nodes);
+    if (is("sweeps")) return nb::cast(f.sweeps);
+    if (is("finite")) return nb::cast(f.finite);
+    if (is("effective")) return nb::cast(f.effective);
+    if (is("log_evidence")) return nb::cast(f.log_evidence);
+    if (is("log_prior")) return nb::cast(f.log_prior);
+    if (is("log_mode")) return nb::cast(f.log_mode);
+    if (is("residual")) return nb::cast(f.residual);
+    if (is("rate")) return f.with_rate ? nb::cast(f.rate) : nb::none();
+    if (is("since")) return nb::cast(f.since);
+    nb::object found = f.get(name, self);
+    if (!found.is_valid()) throw nb::key_error(name);
+    return found;
+}
+
 nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, double damping,
              std::optional<nb::tuple> sites) {
     want(s.ndim() == 2 && s.shape(0) >= 1 && eps.size() == s.shape(0), "s (members, groups), eps (members,)");
     const std::size_t members = s.shape(0);
-    Problem p(problem, members);
+    Problem p = Problem::whole(problem, members);
     hw::EpArgs& a = p.a;
     want(s.shape(1) == static_cast<std::size_t>(a.groups), "s (members, groups)");
     const std::size_t stages = a.T + 1, n = a.n, rows = a.rows;
@@ -227,191 +374,202 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
     return found;
 }
 
-nb::dict learn(const nb::dict& problem, InBool free, In floor, In cap, In scale, In start, In count,
-               InBool squared, bool learn_eps, double rate, double start_eps, double power, double beta_a, double beta_b, In z,
-               const nb::dict& limits, std::optional<nb::tuple> before, int drop, int shaped, std::optional<In> pull,
-               std::optional<In> precision, std::optional<In> known_power, std::optional<nb::dict> outside) {
-    want(z.ndim() == 2 && z.shape(0) >= 1, "z (nodes, q)");
-    const std::size_t nodes = z.shape(0), abreast = (nodes + hw::ep_abreast - 1) / hw::ep_abreast * hw::ep_abreast;
-    Problem p(problem, abreast);
-    std::optional<Problem> bounds;
-    if (outside) bounds.emplace(*outside, abreast);
-    hw::EpLearnArgs l{};
-    hw::EpArgs& a = p.a;
-    const std::size_t stages = a.T + 1, n = a.n, rows = a.rows, groups = a.groups;
-    want(free.size() == groups && floor.size() == groups && cap.size() == groups && scale.size() == groups &&
-             start.size() == groups && count.size() == groups && squared.size() == groups, "one entry a half-width");
-    std::size_t q = learn_eps ? 1 : 0;
-    for (std::size_t g = 0; g < groups; g++) q += free.data()[g] ? 1 : 0;
-    want(q <= std::size_t(hw::ep_free), "at most 16 free parameters");
-    want(z.shape(1) == q, "z (nodes, q)");
-    l.free = free.data();
-    l.squared = squared.data();
-    l.floor = floor.data();
-    l.cap = cap.data();
-    l.scale = scale.data();
-    l.start = start.data();
-    l.count = count.data();
-    want(pull.has_value() == precision.has_value() && pull.has_value() == known_power.has_value(),
-         "pull, precision and known_power go together");
-    if (pull) {
-        want(pull->size() == groups && precision->size() == groups * groups && known_power->size() == groups,
-             "pull (groups,), precision (groups,groups), known_power (groups,)");
-        l.pull = pull->data();
-        l.precision = precision->data();
-        l.known_power = known_power->data();
-    }
-    l.learn_eps = learn_eps;
-    l.rate = rate;
-    l.start_eps = start_eps;
-    l.power = power;
-    l.beta_a = beta_a;
-    l.beta_b = beta_b;
-    l.z = z.data();
-    l.nodes = static_cast<int>(nodes);
-    const auto whole = [&](const char* name) { return nb::cast<int>(limits[name]); };
-    const auto real = [&](const char* name) { return nb::cast<double>(limits[name]); };
-    l.steps = whole("steps");
-    l.few = whole("few");
-    l.many = whole("many");
-    l.most = whole("most");
-    l.tol = real("tol");
-    l.tol_nodes = real("tol_nodes");
-    l.close = real("close");
-    l.near = real("near");
-    l.least = real("least");
-    l.stage = whole("stage");
-    l.enough = real("enough");
-    l.usable = real("usable");
-    l.narrow = real("narrow");
-    l.warp = real("warp");
-    l.reference = real("reference");
-    l.condition = real("condition");
-    a.damping = real("damping");
-    nb::dict found;
-    found["sites"] = p.sites(std::nullopt, 1);
-    const std::size_t columns = (nodes + abreast - 1) / abreast * abreast;
-    int since = 0;
-    bool sound = false;
-    l.finite = &sound;
-    l.since = &since;
-    l.again = whole("again");
-    l.columns = static_cast<int>(columns);
-    found["lanes"] = fresh({2 * (stages * n + rows), columns}, &l.lanes);
-    found["lane_phi"] = fresh({columns, q}, &l.lane_phi);
-    hw::EpBefore old{};
-    InInt old_start;
-    In old_sites[8];
-    if (before) {
-        want(before->size() == 12 && drop >= 0,
-             "before: (start, m, D, tau, nu, lanes, lane_phi, mode, H, log_mode, log_prior, since)");
-        old_start = nb::cast<InInt>((*before)[0]);
-        want(old_start.size() >= 2, "before: start");
-        old.stages = static_cast<int>(old_start.size()) - 1;
-        old.drop = drop;
-        old.start = old_start.data();
-        for (int t = 0; t < old.stages; t++) want(old.start[t] >= 0 && old.start[t] <= old.start[t + 1], "before: start");
-        const double** into[4] = {&old.m, &old.D, &old.tau, &old.nu};
-        for (int k = 0; k < 4; k++) {
-            old_sites[k] = nb::cast<In>((*before)[k + 1]);
-            want(old_sites[k].size() == (k < 2 ? old.stages * n : std::size_t(old.start[old.stages])), "before: sites");
-            *into[k] = old_sites[k].data();
+// A chain without its data whose half-widths are to be found, judged once.
+class EpFrame {
+  public:
+    EpFrame(const nb::dict& problem, InBool free, In cap, In count, InBool squared, bool learn_eps, double rate, double start_eps,
+            double power, double beta_a, double beta_b, In z, const nb::dict& limits, const std::optional<nb::dict>& outside)
+        : p_(problem, whole_registers(z.shape(0))), free_(free), cap_(cap), count_(count), squared_(squared), z_(z) {
+        want(z.ndim() == 2 && z.shape(0) >= 1, "z (nodes, q)");
+        if (outside) {
+            bounds_.emplace(*outside, whole_registers(z.shape(0)));
+            want(bounds_->a.T == p_.a.T && bounds_->a.n == p_.a.n && bounds_->a.groups == p_.a.groups, "outside: another chain");
+            none_.resize(bounds_->a.rows);
         }
-        for (int k = 4; k < 8; k++) old_sites[k] = nb::cast<In>((*before)[k + 1]);
-        const std::size_t old_columns = old_sites[4].size() / (2 * (old.stages * n + old.start[old.stages]));
-        if (old_columns == columns && old_sites[5].size() == columns * q && old_sites[6].size() == q &&
-            old_sites[7].size() == q * q && old_sites[4].size() == 2 * columns * (old.stages * n + old.start[old.stages])) {
-            old.lanes = old_sites[4].data();
-            old.lane_phi = old_sites[5].data();
-            old.mode = old_sites[6].data();
-            old.H = old_sites[7].data();
-            old.log_mode = nb::cast<double>((*before)[9]);
-            old.log_prior = nb::cast<double>((*before)[10]);
-            old.since = nb::cast<int>((*before)[11]);
+        const std::size_t groups = p_.a.groups;
+        want(free.size() == groups && cap.size() == groups && count.size() == groups && squared.size() == groups, "one entry a half-width");
+        q_ = learn_eps ? 1 : 0;
+        for (std::size_t g = 0; g < groups; g++) q_ += free.data()[g] ? 1 : 0;
+        want(q_ <= std::size_t(hw::ep_free), "at most 16 free parameters");
+        want(z.shape(1) == q_, "z (nodes, q)");
+        l_.free = free_.data();
+        l_.squared = squared_.data();
+        l_.cap = cap_.data();
+        l_.count = count_.data();
+        l_.learn_eps = learn_eps;
+        l_.rate = rate;
+        l_.start_eps = start_eps;
+        l_.power = power;
+        l_.beta_a = beta_a;
+        l_.beta_b = beta_b;
+        l_.z = z_.data();
+        l_.nodes = static_cast<int>(z.shape(0));
+        l_.columns = static_cast<int>(whole_registers(z.shape(0)));
+        const auto whole = [&](const char* name) { return nb::cast<int>(limits[name]); };
+        const auto real = [&](const char* name) { return nb::cast<double>(limits[name]); };
+        l_.steps = whole("steps");
+        l_.few = whole("few");
+        l_.many = whole("many");
+        l_.most = whole("most");
+        l_.tol = real("tol");
+        l_.tol_nodes = real("tol_nodes");
+        l_.close = real("close");
+        l_.near = real("near");
+        l_.least = real("least");
+        l_.stage = whole("stage");
+        l_.enough = real("enough");
+        l_.usable = real("usable");
+        l_.narrow = real("narrow");
+        l_.warp = real("warp");
+        l_.reference = real("reference");
+        l_.condition = real("condition");
+        l_.again = whole("again");
+        p_.a.damping = real("damping");
+    }
+
+    // one window: `before` as an earlier one handed it on, `drop` rows before this one; `known` in the order of `told`.
+    // Returns what was found, and what it hands on.
+    nb::tuple learn(In floor, In scale, In start, In m0, In P0, In half0, In b, In y, nb::handle before, int drop, int shaped,
+                     std::optional<In> known) const {
+        hw::EpLearnArgs l = l_;
+        hw::EpArgs a = p_.a, bounds{};
+        Problem::of_window(a, m0, P0, half0, b, y);
+        const std::size_t stages = a.T + 1, n = a.n, rows = a.rows, groups = a.groups, nodes = l.nodes, abreast = a.members;
+        want(floor.size() == groups && scale.size() == groups && start.size() == groups, "floor, scale, start (groups,)");
+        want(shaped >= 0, "shaped: a stage");
+        l.floor = floor.data();
+        l.scale = scale.data();
+        l.start = start.data();
+        l.shaped = shaped;
+        if (known) {
+            want(known->size() == groups * (groups + 2), "known: pull (groups,), precision (groups,groups), power (groups,)");
+            l.pull = known->data();
+            l.precision = l.pull + groups;
+            l.known_power = l.precision + groups * groups;
         }
-        l.before = &old;
+        nb::object made = nb::cast(new EpFound, nb::rv_policy::take_ownership);
+        EpFound& found = *nb::inst_ptr<EpFound>(made);
+        nb::object on = nb::cast(new EpHanded(a.start, stages, n, q_, l.columns), nb::rv_policy::take_ownership);
+        EpHanded& handed = *nb::inst_ptr<EpHanded>(on);
+        a.m = handed.m;
+        a.D = handed.D;
+        a.tau = handed.tau;
+        a.nu = handed.nu;
+        l.lanes = handed.lanes;
+        l.lane_phi = handed.lane_phi;
+        l.edge_x = handed.edge_x;
+        l.edge_P = handed.edge_P;
+        l.since = &found.since;
+        l.log_mode = &found.log_mode;
+        hw::EpBefore old{};
+        if (!before.is_none()) {
+            const EpHanded& h = *nb::cast<const EpHanded*>(before);
+            want(h.n == n && drop >= 0, "before: another chain");
+            old.stages = static_cast<int>(h.stages());
+            old.drop = drop;
+            old.start = h.start.data();
+            old.m = h.m;
+            old.D = h.D;
+            old.tau = h.tau;
+            old.nu = h.nu;
+            if (h.columns == handed.columns && h.q == q_) {
+                old.lanes = h.lanes;
+                old.lane_phi = h.lane_phi;
+                old.mode = h.mode;
+                old.H = h.H;
+                old.log_mode = h.log_mode;
+                old.log_prior = h.log_prior;
+                old.since = h.since;
+            }
+            l.before = &old;
+        }
+        const bool outliers = l.learn_eps || l.rate > 0.0;
+        double* told = nullptr;
+        found.add("x", {stages, n}, &l.x);
+        found.add("P", {stages, n, n}, &l.P);
+        found.add("k3", {stages, n}, &l.k3);
+        found.add("k4", {stages, n}, &l.k4);
+        found.add("mean", {groups}, &l.mean);
+        found.add("sd", {groups}, &l.sd);
+        found.add("lo", {groups}, &l.quantile_lo);
+        found.add("hi", {groups}, &l.quantile_hi);
+        found.add("told", {groups * (groups + 2)}, &told);
+        found.add("mode", {q_}, &l.mode);
+        found.add("H", {q_, q_}, &l.H);
+        found.add("phi", {nodes, q_}, &l.phi);
+        found.add("log_weight", {nodes}, &l.log_weight);
+        found.add("slope", {nodes, q_}, &l.node_slope);
+        found.add("second", {nodes}, &l.second);
+        if (outliers) found.add("out", {rows}, &l.out);
+        found.make();
+        l.told_pull = told;
+        l.told_precision = told + groups;
+        l.told_power = l.told_precision + groups * groups;
+        for (std::size_t g = 0; g < groups; g++)
+            l.mean[g] = l.quantile_lo[g] = l.quantile_hi[g] = l.squared[g] ? floor.data()[g] * floor.data()[g] : floor.data()[g];
+        l.found_rate = &found.rate;
+        l.effective = &found.effective;
+        l.log_evidence = &found.log_evidence;
+        l.log_prior = &found.log_prior;
+        l.residual = &found.residual;
+        l.finite = &found.finite;
+        l.used = &found.nodes;
+        l.sweeps_used = &found.sweeps;
+        if (bounds_) {
+            bounds = bounds_->a;
+            Problem::of_window(bounds, m0, P0, half0);
+            bounds.b = a.b;
+            bounds.y = {none_.data(), nullptr, 1, 0};
+            l.outside = &bounds;
+        }
+        {
+            nb::gil_scoped_release release;
+            const std::size_t size = abreast * (stages * n * (n + 3) + rows) + stages * n + 3 * nodes;
+            Work lanes(size);
+            double* p = lanes.p;
+            const auto take = [&](std::size_t count) {
+                double* first = p;
+                p += count;
+                return first;
+            };
+            a.x = take(abreast * stages * n);
+            a.P = take(abreast * stages * n * n);
+            a.k3 = take(abreast * stages * n);
+            a.k4 = take(abreast * stages * n);
+            a.out = outliers ? take(abreast * rows) : nullptr;
+            bounds.x = a.x;
+            bounds.P = a.P;
+            l.centre = take(stages * n);
+            l.value = take(nodes);
+            l.share = take(nodes);
+            l.residuals = take(nodes);
+            l.base = a;
+            Work work(HW_PICK_WIDE(ep_learn_workspace)(l));
+            l.base.work = work.p;
+            found.code = HW_PICK_WIDE(ep_learn)(l);
+        }
+        found.with_rate = l.learn_eps;
+        handed.log_prior = found.log_prior;
+        handed.log_mode = found.log_mode;
+        handed.since = found.since;
+        std::copy(l.mode, l.mode + q_, handed.mode);
+        std::copy(l.H, l.H + q_ * q_, handed.H);
+        return nb::make_tuple(made, on);
     }
-    want(shaped >= 0, "shaped: a stage");
-    l.shaped = shaped;
-    const bool outliers = learn_eps || rate > 0.0;
-    double* of_lanes[5];
-    nb::object held[5] = {fresh({abreast, stages, n}, of_lanes), fresh({abreast, stages, n, n}, of_lanes + 1),
-                          fresh({abreast, stages, n}, of_lanes + 2), fresh({abreast, stages, n}, of_lanes + 3),
-                          fresh({abreast, rows}, of_lanes + 4)};
-    a.x = of_lanes[0];
-    a.P = of_lanes[1];
-    a.k3 = of_lanes[2];
-    a.k4 = of_lanes[3];
-    a.out = outliers ? of_lanes[4] : nullptr;
-    if (bounds) {
-        want(bounds->a.T == a.T && bounds->a.n == a.n && bounds->a.groups == a.groups, "outside: another chain");
-        bounds->a.x = a.x;
-        bounds->a.P = a.P;
-        l.outside = &bounds->a;
-    }
-    found["mode"] = fresh({q}, &l.mode);
-    found["H"] = fresh({q, q}, &l.H);
-    found["phi"] = fresh({nodes, q}, &l.phi);
-    found["log_weight"] = fresh({nodes}, &l.log_weight);
-    found["slope"] = fresh({nodes, q}, &l.node_slope);
-    found["second"] = fresh({nodes}, &l.second);
-    std::vector<double> of_nodes(3 * nodes);
-    l.value = of_nodes.data();
-    l.share = l.value + nodes;
-    l.residuals = l.share + nodes;
-    found["x"] = fresh({stages, n}, &l.x);
-    found["P"] = fresh({stages, n, n}, &l.P);
-    found["k3"] = fresh({stages, n}, &l.k3);
-    found["k4"] = fresh({stages, n}, &l.k4);
-    nb::object centre = fresh({stages, n}, &l.centre);
-    found["out"] = nb::none();
-    if (outliers) found["out"] = fresh({rows}, &l.out);
-    found["mean"] = fresh({groups}, &l.mean, floor.data());
-    found["sd"] = fresh({groups}, &l.sd);
-    found["lo"] = fresh({groups}, &l.quantile_lo, floor.data());
-    found["hi"] = fresh({groups}, &l.quantile_hi, floor.data());
-    for (std::size_t g = 0; g < groups; g++)
-        if (squared.data()[g])
-            for (double* v : {l.mean, l.quantile_lo, l.quantile_hi}) v[g] *= v[g];
-    found["told_pull"] = fresh({groups}, &l.told_pull);
-    found["told_precision"] = fresh({groups, groups}, &l.told_precision);
-    found["told_power"] = fresh({groups}, &l.told_power);
-    found["edge_x"] = fresh({stages, n}, &l.edge_x);
-    found["edge_P"] = fresh({stages, n, n}, &l.edge_P);
-    double found_rate = 0.0, effective = 0.0;
-    l.found_rate = &found_rate;
-    l.effective = &effective;
-    double log_evidence = 0.0, log_prior = 0.0, log_mode = 0.0, residual = 0.0;
-    std::int32_t used = 0;
-    long sweeps = 0;
-    l.log_evidence = &log_evidence;
-    l.log_prior = &log_prior;
-    l.log_mode = &log_mode;
-    l.residual = &residual;
-    l.used = &used;
-    l.sweeps_used = &sweeps;
-    int code;
-    {
-        nb::gil_scoped_release release;
-        l.base = a;
-        Work work(HW_PICK_WIDE(ep_learn_workspace)(l));
-        l.base.work = work.p;
-        code = HW_PICK_WIDE(ep_learn)(l);
-    }
-    found["code"] = code;
-    found["effective"] = effective;
-    found["since"] = since;
-    found["finite"] = sound;
-    found["rate"] = nb::none();
-    if (learn_eps) found["rate"] = found_rate;
-    found["log_evidence"] = log_evidence;
-    found["log_prior"] = log_prior;
-    found["log_mode"] = log_mode;
-    found["residual"] = residual;
-    found["nodes"] = used;
-    found["sweeps"] = sweeps;
-    return found;
-}
+
+  private:
+    static std::size_t whole_registers(std::size_t nodes) { return (nodes + hw::ep_abreast - 1) / hw::ep_abreast * hw::ep_abreast; }
+
+    Problem p_;
+    std::optional<Problem> bounds_;
+    std::vector<double> none_;  // outputs of bounds
+    InBool free_;
+    In cap_, count_;
+    InBool squared_;
+    In z_;
+    hw::EpLearnArgs l_{};
+    std::size_t q_ = 0;
+};
 
 nb::tuple known(InBool free, In start, In pull, In precision, In power) {
     const std::size_t p = free.size();
@@ -431,10 +589,20 @@ void bind_ep(nb::module_& mod) {
             "Expectation propagation on a chain for given half-widths, one set a member; see core/ep_entry.hpp.");
     mod.def("ep_known", &known, "free"_a, "start"_a, "pull"_a, "precision"_a, "power"_a,
             "What is known of the free half-widths alone, whatever the others are; see core/ep_handover.hpp.");
-    mod.def("ep_learn", &learn, "problem"_a, "free"_a, "floor"_a, "cap"_a, "scale"_a, "start"_a, "count"_a,
-            "squared"_a, "learn_eps"_a,
-            "rate"_a, "start_eps"_a, "power"_a, "beta_a"_a, "beta_b"_a, "z"_a, "limits"_a,
-            "before"_a.none() = nb::none(), "drop"_a = 0, "shaped"_a = 0, "pull"_a.none() = nb::none(), "precision"_a.none() = nb::none(),
-            "known_power"_a.none() = nb::none(), "outside"_a.none() = nb::none(),
-            "The same with half-widths found by evidence and what is not known of them carried into the answer.");
+    nb::class_<EpHanded>(mod, "EpHanded", "What the next window of a stream may take up; see core/ep_handover.hpp.")
+        .def("__init__", &load, "start"_a, "n"_a, "q"_a, "columns"_a, "log_mode"_a, "log_prior"_a, "since"_a, "arrays"_a)
+        .def("save", &save, "All of it, as the arguments of another one.")
+        .def("__getitem__", [](nb::handle self, const char* name) {
+            nb::object found = nb::inst_ptr<EpHanded>(self)->get(name, self);
+            if (!found.is_valid()) throw nb::key_error(name);
+            return found;
+        });
+    nb::class_<EpFound>(mod, "EpFound", "What a window found, array by array as it is asked for.").def("__getitem__", &item);
+    nb::class_<EpFrame>(mod, "EpFrame", "A chain without its data whose half-widths are to be found by evidence; see core/ep_learn.hpp.")
+        .def(nb::init<const nb::dict&, InBool, In, In, InBool, bool, double, double, double, double, double, In, const nb::dict&,
+                      const std::optional<nb::dict>&>(),
+             "problem"_a, "free"_a, "cap"_a, "count"_a, "squared"_a, "learn_eps"_a, "rate"_a, "start_eps"_a, "power"_a, "beta_a"_a,
+             "beta_b"_a, "z"_a, "limits"_a, "outside"_a.none() = nb::none())
+        .def("learn", &EpFrame::learn, "floor"_a, "scale"_a, "start"_a, "m0"_a, "P0"_a, "half0"_a, "b"_a, "y"_a,
+             "before"_a.none() = nb::none(), "drop"_a = 0, "shaped"_a = 0, "known"_a.none() = nb::none());
 }

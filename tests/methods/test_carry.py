@@ -176,7 +176,7 @@ def test_what_a_window_hands_on_equals_the_twin(nodes):
     for name, twin in zip(("mean", "sd", "lo", "hi"), widths, strict=True):
         np.testing.assert_allclose(found[name][free], twin, rtol=1e-10)
     assert found["effective"] == pytest.approx(effective, rel=1e-10)
-    x, P = naive_carry.edge(answer.chain.problem, found["sites"])
+    x, P = naive_carry.edge(answer.chain.problem, [found[k] for k in ("m", "D", "tau", "nu")])
     np.testing.assert_allclose(found["edge_x"], x, atol=1e-11)
     np.testing.assert_allclose(found["edge_P"], P, atol=1e-11)
 

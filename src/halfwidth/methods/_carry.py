@@ -30,6 +30,7 @@ Varin, Reid and Firth (2011), An overview of composite likelihood methods, Stati
 
 import base64
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -40,14 +41,11 @@ from halfwidth.methods._sites import Frame, Sites
 from halfwidth.spread import Normal
 
 if TYPE_CHECKING:
-    from halfwidth.methods.posterior import Answer
+    from halfwidth.methods._answer import Answer
 
 #: Sweeps of the chain with its bounds alone, and the log share of a cavity inside a bound from which it is believed.
 _SWEEPS, _WORST = 50, -60.0
 
-
-#: What the core found in a window and takes up in the next, beside the sites of the mode.
-HANDED_ON = ("lanes", "lane_phi", "mode", "H", "log_mode", "log_prior", "since")
 
 #: Rows in which staying inside the bounds counts as an event: a prior against half-widths so wide that bounds alone
 #: shape the path. In longer records bounds are a condition in the others.
@@ -59,25 +57,67 @@ def condition(rows: float) -> float:
     return max(0.0, 1.0 - EVENT / max(rows, 1.0))
 
 
-class Known(NamedTuple):
-    """What is known of half-widths s = (q, r): a factor s^power exp(pull' s - s' precision s / 2)."""
+class Known:
+    """What is known of half-widths s = (q, r): a factor s^power exp(pull' s - s' precision s / 2).
 
-    pull: Array
-    precision: Array
-    power: Array
+    Parameters
+    ----------
+    pull, precision, power : (p,), (p, p), (p,) arrays
+
+    Attributes
+    ----------
+    values : (p (p + 2),) array
+        All of it, one after the other.
+    """
+
+    __slots__ = ("values",)
+    values: Array
+
+    def __init__(self, pull: Array, precision: Array, power: Array) -> None:
+        self.values = np.concatenate((pull, np.ravel(precision), power), dtype=float)
+
+    @classmethod
+    def of(cls, values: Array) -> "Known":
+        """Wrap what the core found."""
+        known = object.__new__(cls)
+        known.values = values
+        return known
 
     @classmethod
     def none(cls, p: int) -> "Known":
         """Nothing is known of p half-widths."""
-        return cls(np.zeros(p), np.zeros((p, p)), np.zeros(p))
+        return cls.of(np.zeros(p * (p + 2)))
+
+    @property
+    def _p(self) -> int:
+        return math.isqrt(self.values.size + 1) - 1
+
+    @property
+    def pull(self) -> Array:
+        """(p,)."""
+        return self.values[: self._p]
+
+    @property
+    def precision(self) -> Array:
+        """(p, p)."""
+        p = self._p
+        return self.values[p : -p or None].reshape(p, p)
+
+    @property
+    def power(self) -> Array:
+        """(p,)."""
+        return self.values[self.values.size - self._p :]
+
+    def __iter__(self) -> Iterator[Array]:
+        return iter((self.pull, self.precision, self.power))
 
     def plus(self, other: "Known", weight: float = 1.0) -> "Known":
         """Add what other rows told."""
-        return Known(*(own + weight * more for own, more in zip(self, other, strict=True)))
+        return Known.of(self.values + weight * other.values)
 
     def times(self, weight: float) -> "Known":
         """Return it weighted."""
-        return Known(*(weight * own for own in self))
+        return Known.of(weight * self.values)
 
 
 def inside(chain: Sites, s: Array) -> Known:
@@ -103,14 +143,10 @@ def inside(chain: Sites, s: Array) -> Known:
 
 
 class Start(NamedTuple):
-    """Where a search may start: half-widths (p,), and the sites of a solved chain that belong to them.
-
-    These are the first row of each of its stages (T + 2,), m and D of its noise, tau and nu of its rows, and
-    `HANDED_ON` (`EpBefore` in core/ep_entry.hpp).
-    """
+    """Where a search may start: half-widths (p,), and what a solved chain hands on that they belong to."""
 
     s: Array
-    before: tuple[Any, ...] | None = None
+    before: _core.EpHanded | None = None
 
 
 class Carried:
@@ -142,20 +178,22 @@ class Carried:
         self.start: Start | None = None
         self.first: Normal | None = None  # the state before the first row, once rows have left
         self.frames: dict[bytes, Frame] = {}
-        self._edge: tuple[Array, Array] | None = None  # mean and covariance of the newest window's stages, each given
-        # what lies up to it: the forwards message of expectation propagation
+        self._newest: _core.EpHanded | None = None  # of the newest window; it has the messages at its edge
 
     def known(self, first: int, rows: int) -> Known | None:
         """Return what the windows tell that have no row from `first` on, for one of so many rows; None: nothing."""
-        self.gone, self.kept_in = self.gone.times(self.fade), self.kept_in.times(self.fade)
+        gone, kept_in = self.gone.values, self.kept_in.values
+        gone *= self.fade
+        kept_in *= self.fade
         self.rows *= self.fade
         while self.waiting and self.waiting[0][0] < first:
-            _, told, kept_in = self.waiting.pop(0)
-            self.gone, self.kept_in = self.gone.plus(told), self.kept_in.plus(kept_in)
+            _, told, bounds = self.waiting.pop(0)
+            gone += told.values
+            kept_in += bounds.values
             self.rows += 1.0
         self.given = None
         if self.rows:
-            self.given = self.gone.plus(self.kept_in.plus(self.inside), -condition(rows + self.rows))
+            self.given = Known.of(gone - condition(rows + self.rows) * (kept_in + self.inside.values))
         return self.given
 
     def leave(self, a: int) -> None:
@@ -163,24 +201,27 @@ class Carried:
         self.first = self._state(a) if a else self.first
 
     def _state(self, a: int) -> Normal | None:
-        if self._edge is None or len(self._edge[0]) <= a:
+        """Return what is known of the state after the first a rows by all up to it."""
+        if self._newest is None:
             return None
-        x, P = self._edge[0][a], self._edge[1][a]
+        x, P = self._newest["edge_x"], self._newest["edge_P"]
+        if len(x) <= a:
+            return None
+        x, P = x[a].copy(), P[a].copy()
         d = P.diagonal()
-        if not (np.isfinite(x).all() and np.isfinite(P).all() and (d > 0).all()):
+        if not (math.isfinite(x.sum() + P.sum()) and d.min() > 0):
             return None
-        P = P.copy()
-        P.flat[:: len(x) + 1] += 1e-12 * d
+        P.flat[:: len(x) + 1] *= 1.0 + 1e-12
         return Normal.of(x, P)
 
     def take(self, answer: "Answer", newest: int, rows: int, *, counts: bool) -> None:
         """Keep what a window told: its newest row's number, its number of rows, and whether it told anything new."""
-        if not answer.estimate.status.good:
-            self._edge = None
+        if not answer.status.good:
+            self._newest = None
             self.start = None if self.start is None else Start(self.start.s)
             return
         self.start = answer.start
-        self._edge = answer.found["edge_x"], answer.found["edge_P"]
+        self._newest = answer.handed
         if not counts:
             return
         if self.count % rows == 0:
@@ -196,9 +237,9 @@ class Carried:
             "waiting": [[k, _plain(told), _plain(inside)] for k, told, inside in self.waiting],
             "count": self.count,
             "s": None if start is None else start.s.tolist(),
-            "before": None if start is None or start.before is None else [_bytes(v) for v in start.before],
+            "before": None if start is None or start.before is None else _plain_handed(start.before),
             "first": None if self.first is None else [self.first.mean.tolist(), self.first.P.tolist()],
-            "edge": None if self._edge is None else [v.tolist() for v in self._edge],
+            "edge": self._newest is not None,
         }
 
     def load(self, saved: dict[str, Any]) -> None:
@@ -210,28 +251,25 @@ class Carried:
         self.count = int(saved["count"])
         self.start = None
         if saved["s"] is not None:
-            before = saved["before"]
-            if before is not None:
-                start, *values, log_mode, log_prior, since = (_array(v) for v in before)
-                before = (start.astype(np.int32), *values, float(log_mode[0]), float(log_prior[0]), int(since[0]))
+            before = None if saved["before"] is None else _handed(saved["before"])
             self.start = Start(np.array(saved["s"], dtype=float), before)
-        first, edge = saved["first"], saved["edge"]
-        self.first = None if first is None else Normal(*first)
-        self._edge = None if edge is None else (np.array(edge[0], dtype=float), np.array(edge[1], dtype=float))
+        self.first = None if saved["first"] is None else Normal(*saved["first"])
+        self._newest = self.start.before if saved["edge"] and self.start is not None else None
 
 
 def _plain(known: Known) -> list[Any]:
-    return [v.tolist() for v in known]
+    return [float(v) for v in known.values]
 
 
 def _known(saved: list[Any]) -> Known:
-    return Known(*(np.array(v, dtype=float) for v in saved))
+    return Known.of(np.array(saved, dtype=float))
 
 
-def _bytes(value: Any) -> str:
-    """Return numbers as text, all bits of them."""
-    return base64.b64encode(np.ascontiguousarray(value, dtype="<f8").tobytes()).decode()
+def _plain_handed(handed: _core.EpHanded) -> list[Any]:
+    *plain, arrays = handed.save()
+    return [*plain, [base64.b64encode(np.ascontiguousarray(v, dtype="<f8").tobytes()).decode() for v in arrays]]
 
 
-def _array(text: str) -> Array:
-    return np.frombuffer(base64.b64decode(text), dtype="<f8").astype(float)
+def _handed(saved: list[Any]) -> _core.EpHanded:
+    *plain, arrays = saved
+    return _core.EpHanded(*plain, [np.frombuffer(base64.b64decode(v), dtype="<f8").astype(float) for v in arrays])

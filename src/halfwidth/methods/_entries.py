@@ -19,7 +19,8 @@ from halfwidth.spread import Shaped
 
 if TYPE_CHECKING:
     from halfwidth.methods._carry import Start
-    from halfwidth.methods.posterior import Answer, Posterior
+    from halfwidth.methods._answer import Answer
+    from halfwidth.methods.posterior import Posterior
 
 _STEPS = 40
 _NODES = 24
@@ -74,7 +75,7 @@ class _Search:
     def at(self, theta: Array) -> float:
         """Return log evidence at the mode of the half-widths, and keep the best."""
         answer = self.method.answer(self.model(theta), self.record, start=self.start)
-        if not np.isfinite(answer.found["log_mode"]) or int(answer.found["code"]) >= 2:
+        if not np.isfinite(answer.found["log_mode"]) or answer.code >= 2:
             return -math.inf
         value = float(answer.found["log_mode"])
         if value > self.value:

@@ -21,7 +21,8 @@ from halfwidth.trace import Untraceable, compiled
 
 if TYPE_CHECKING:
     from halfwidth.methods._carry import Known, Start
-    from halfwidth.methods.posterior import Answer, Posterior
+    from halfwidth.methods._answer import Answer
+    from halfwidth.methods.posterior import Posterior
 
 #: A step below this share of the standard deviations ends the iteration, and one below the second is good enough.
 _CLOSE, _USABLE = 1e-3, 0.1
@@ -52,7 +53,7 @@ def relinearised(
         status = Status.REDUCED if moved < _USABLE else Status.STALLED
         info["message"] = f"{status.value}: after {rounds} linearisations the states still move by {moved:.2g} sd"
     est = replace(est, status=status, names=model.names.x, labels=record.labels, info=info)
-    return answer._replace(estimate=est)
+    return answer.amended(est)
 
 
 def linearised(model: Nonlinear, record: Record, X: Array) -> tuple[Linear, Record]:

@@ -247,16 +247,21 @@ def first_scales(model: Linear, seen: Sequence[Array]) -> Array:
 
 def scales(effect: Array, seen: Sequence[Array]) -> Array:
     """Return the first scales of a model with this `felt`."""
+    steps = [float(np.abs(y[1:] - y[:-1]).sum()) / max(len(y) - 1, 1) for y in seen]
+    return scales_of_steps(effect, steps, seen)
+
+
+def scales_of_steps(effect: Array, steps: Sequence[float], seen: Sequence[Array]) -> Array:
+    """Return the same from the typical step of each output."""
     ny, nx = effect.shape
     sigma, weight = np.ones(nx + ny), np.zeros(ny)
-    for j, y in enumerate(seen):
-        level = np.abs(y[1:] - y[:-1]).sum() / max(len(y) - 1, 1)
+    for j, (level, y) in enumerate(zip(steps, seen, strict=True)):
         if not level > 0 and len(y):
-            level = np.std(y)
-        if level > 0:
-            sigma[nx + j] = level
+            level = float(np.std(y))
+        level = level if level > 0 else 1.0
+        sigma[nx + j] = level
         if len(y):
-            weight[j] = 1.0 / sigma[nx + j] ** 2
+            weight[j] = 1.0 / level**2
     gram = weight @ effect
     told = gram > 0
     sigma[:nx][told] = 1.0 / np.sqrt(gram[told])

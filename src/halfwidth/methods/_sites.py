@@ -9,15 +9,17 @@ half-widths (q, r). Its rows are taken as they are, since nothing can be whitene
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
+import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.methods._residuals import _eliminate, felt, reference, residuals, scales
+from halfwidth.methods._residuals import _eliminate, felt, reference, residuals, scales, scales_of_steps
 from halfwidth.model import Linear, Model
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
 from halfwidth.record import Record
@@ -34,8 +36,8 @@ _LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Sites:
-    """The arrays of a problem, and which half-widths are to be found.
+class Frame:
+    """What the chains of one model have in common in all windows of the same rows seen.
 
     There are p = nx + ny groups, the half-widths (q, r), or twice as many: then the other half are the standard
     deviations of Gaussian parts of w and e whose variances are unknown.
@@ -43,75 +45,31 @@ class Sites:
     Parameters
     ----------
     problem : dict
-        For the core.
+        The entries of `Sites.problem` that no data are in.
     free : (p,) bool array
         Groups that are unknown and have rows.
-    floor, cap, scale, count : (p,) arrays
-        Bounds, order of size, and number of rows of each.
+    floor, cap, count : (p,) arrays
+        Bounds, and number of rows of each.
     uniform : (p,) bool array
         Which entries have a half-width at all.
     fitted : (p,) bool array
         Which entries belong to a noise with unknown variances; `free` says which are.
     row, output : (K,) int arrays
         Row of the record and output of each row of the chain; -1 where it is a bound.
-    gaussian : bool
-        Whether no factor but that of x0 may be bounded.
-    """
-
-    problem: dict[str, Any]
-    free: NDArray[np.bool_]
-    floor: Array
-    cap: Array
-    scale: Array
-    count: Array
-    uniform: NDArray[np.bool_]
-    fitted: NDArray[np.bool_]
-    row: NDArray[np.intp]
-    output: NDArray[np.intp]
-    gaussian: bool
-
-    @property
-    def guess(self) -> Array:
-        """Generous first values of all groups from the data's scale, (p,)."""
-        size = np.where(self.fitted, self.scale, math.sqrt(3.0) * self.scale)
-        return np.where(self.uniform | self.fitted, size.clip(self.floor, self.cap), 0.0)
-
-    @property
-    def outside(self) -> dict[str, Any] | None:
-        """The chain with its bounds alone, None where there are none; see core/ep_learn.hpp."""
-        p, keep = self.problem, self.problem["kind"] == TRUNCATION
-        if not keep.any():
-            return None
-        rows = {k: np.ascontiguousarray(p[k][keep]) for k in ("h", "y", "kind", "group", "R", "lo", "hi")}
-        before = np.concatenate([[0], np.cumsum(keep)])
-        return p | rows | {"lost": None, "mix": None, "group_R": None, "start": before[p["start"]].astype(np.int32)}
-
-    @property
-    def exact(self) -> bool:
-        """Whether every factor is Gaussian, so that one sweep is the answer."""
-        return self.gaussian and not self.problem["half0"].any()
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """What the chains of one model have in common in all windows of the same rows seen.
-
-    Parameters
-    ----------
-    problem : dict
-        The entries of `Sites.problem` that no data are in.
-    B : (nx, nu) array or None
+    B : (nu, nx) array or None
         Inputs to what is added to the state; None: as the rows of the record have it.
-    Y : (K, ny) array
-        Seen outputs of its row to the target of each row of the chain.
+    Y : (K, ny) or (K,) array
+        Seen outputs of its row to the target of each row of the chain; (K,) where that is one output.
     at : (K,) array
-        That row; 0 where it is a bound, whose target is 0.
+        That row, or the place of that output in y (T, ny); 0 where it is a bound, whose target is 0.
+    whole : bool
+        Whether every output is seen.
     felt : (ny, nx) array
         As `felt` in `_residuals`.
     R : (ny,) array or None
         Variances of Gaussian outputs; None where the noise has a bounded part.
     gaussian : bool
-        As in `Sites`.
+        Whether no factor but that of x0 may be bounded.
     """
 
     problem: dict[str, Any]
@@ -126,9 +84,12 @@ class Frame:
     B: Array | None
     Y: Array
     at: NDArray[np.intp]
+    whole: bool
     felt: Array
     R: Array | None
     gaussian: bool
+    #: Such chains as the core takes them, by what was asked of it.
+    learners: dict[Any, _core.EpFrame] = field(default_factory=dict)
 
     def fits(self, scale: Array, y: Array) -> bool:
         """Say whether no variance is so small beside the outputs y (T, ny), of scale (p,), that it is lifted."""
@@ -136,6 +97,97 @@ class Frame:
             return True
         size = np.maximum(scale[-len(self.R) :], math.sqrt(_EXACT) * np.abs(y).max())
         return bool((2.0 * _EXACT * size**2 < self.R).all())
+
+    def targets(self, y: Array) -> Array:
+        """Return the targets (K,) of the rows of the chain; y (T, ny) is 0 where unseen."""
+        if self.Y.ndim == 1:
+            return np.asarray(self.Y * y.take(self.at))
+        return np.asarray((self.Y * y.take(self.at, axis=0)).sum(axis=1))
+
+    @cached_property
+    def outside(self) -> dict[str, Any] | None:
+        """The chain with its bounds alone, None where there are none; see core/ep_learn.hpp."""
+        p, keep = self.problem, self.problem["kind"] == TRUNCATION
+        if not keep.any():
+            return None
+        rows = {k: np.ascontiguousarray(p[k][keep]) for k in ("h", "kind", "group", "R", "lo", "hi")}
+        before = np.concatenate([[0], np.cumsum(keep)])
+        return p | rows | {"lost": None, "mix": None, "group_R": None, "start": before[p["start"]].astype(np.int32)}
+
+    @cached_property
+    def known(self) -> Array:
+        """The groups that are not free, (p,)."""
+        return np.where(self.floor < self.cap, self.floor, self.cap)
+
+    @cached_property
+    def unseen(self) -> bool:
+        """Whether a group has no row."""
+        return not self.count.all()
+
+    @cached_property
+    def q(self) -> int:
+        """Number of free groups."""
+        return int(self.free.sum())
+
+
+@dataclass(eq=False)
+class Sites:
+    """A chain with its data: `m0`, `P0`, `half0` of x0, `b` (T, nx) and the targets `y` (K,).
+
+    `scale` (p,) is the order of size of each group by these data, and `floor` (p,) the least that it may be.
+    """
+
+    frame: Frame
+    floor: Array
+    scale: Array
+    m0: Array
+    P0: Array
+    half0: Array
+    b: Array
+    y: Array
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """As in `Frame`."""
+        return self.frame.free
+
+    @property
+    def cap(self) -> Array:
+        """As in `Frame`."""
+        return self.frame.cap
+
+    @property
+    def count(self) -> Array:
+        """As in `Frame`."""
+        return self.frame.count
+
+    @cached_property
+    def problem(self) -> dict[str, Any]:
+        """All of it, for the core's `ep_run`."""
+        return self.frame.problem | self.data
+
+    @property
+    def data(self) -> dict[str, Array]:
+        """What is in no frame."""
+        return {"m0": self.m0, "P0": self.P0, "half0": self.half0, "b": self.b, "y": self.y}
+
+    @property
+    def outside(self) -> dict[str, Any] | None:
+        """The chain with its bounds alone, None where there are none."""
+        bounds = self.frame.outside
+        return None if bounds is None else bounds | self.data | {"y": np.zeros(len(bounds["kind"]))}
+
+    @property
+    def guess(self) -> Array:
+        """Generous first values of all groups from the data's scale, (p,)."""
+        fitted = self.frame.fitted
+        size = np.where(fitted, self.scale, math.sqrt(3.0) * self.scale)
+        return np.where(self.frame.uniform | fitted, size.clip(self.floor, self.cap), 0.0)
+
+    @property
+    def exact(self) -> bool:
+        """Whether every factor is Gaussian, so that one sweep is the answer."""
+        return self.frame.gaussian and not self.half0.any()
 
 
 #: Frames that are kept of one model, each of at most so many rows.
@@ -155,42 +207,32 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
 
     `frames` keeps what windows of one model have in common, where its matrices are constant.
     """
-    y = np.where(record.seen, record.y, 0.0)
     kept, frame = b"", None
     if frames is not None and not _half_open(model.x0):
         kept = record.seen.tobytes()
         frame = frames.get(kept)
+    y = record.y if frame is not None and frame.whole else np.where(record.seen, record.y, 0.0)
     effect = felt(model) if frame is None else frame.felt
-    scale = scales(effect, [record.y[record.seen[:, j], j] for j in range(model.ny)])
+    if frame is not None and frame.whole:
+        steps = np.abs(y[1:] - y[:-1]).sum(axis=0) / max(len(y) - 1, 1)
+        scale = scales_of_steps(effect, steps.tolist(), y.T)  # type: ignore[arg-type]
+    else:
+        scale = scales(effect, [record.y[record.seen[:, j], j] for j in range(model.ny)])
     if frame is None or not frame.fits(scale, y):
         frame = _frame(model, record, scale, outliers)
         if frames is not None and kept and _constant(model) and frame.fits(scale, y):
             if len(frames) >= _FRAMES:
                 del frames[next(iter(frames))]
             frames[kept] = frame
-    problem = frame.problem | _first_state(model, record)
     if frame.B is None:
-        problem["b"] = _added(model, record)
+        b = _added(model, record)
     else:
-        problem["b"] = np.zeros((len(record), model.nx)) if record.u is None else record.u @ frame.B.T
-    problem["y"] = (frame.Y * y.take(frame.at, axis=0)).sum(axis=1)
+        b = np.zeros((len(record), model.nx)) if record.u is None else record.u @ frame.B
     floor, cap, fitted = frame.floor, frame.cap, frame.fitted
-    if fitted.any():
+    if len(fitted) > len(scale):
         scale = np.resize(scale, len(fitted))
         floor = np.where(fitted & (floor < cap), np.minimum(np.maximum(floor, _LEAST * scale), cap), floor)
-    return Sites(
-        problem,
-        frame.free,
-        floor,
-        cap,
-        scale,
-        frame.count,
-        frame.uniform,
-        fitted,
-        frame.row,
-        frame.output,
-        frame.gaussian,
-    )
+    return Sites(frame, floor, scale, *_first_state(model, record), b, frame.targets(y))
 
 
 def _half_open(x0: Any) -> bool:
@@ -245,15 +287,19 @@ def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame
     B = None
     if all(m is None or m.constant for m in (model.B, model.E)):
         B = np.zeros((nx, model.nu)) if model.B is None else model.B.single
-        B = B if problem["G"] is None else problem["G"][0] @ B
+        B = np.ascontiguousarray((B if problem["G"] is None else problem["G"][0] @ B).T)
     part = gaussian_part(model.e)
     R = None
     if part is not None and uniform_part(model.e) is None and part.known and part.cov().constant:
         R = np.diagonal(part.cov().single)
     row = stage[order] - 1
+    Y, at = joined("Y", float, (ny,)), np.maximum(row, 0)
+    if (np.count_nonzero(Y, axis=1) <= 1).all():
+        of = np.abs(Y).argmax(axis=1)
+        Y, at = Y[np.arange(len(Y)), of], at * ny + of
     return Frame(
-        problem, free, floor, cap, count, uniform, fitted, row, output, B, joined("Y", float, (ny,)),
-        np.maximum(row, 0), felt(model), R, bool((problem["kind"] == GAUSSIAN).all() and (w_group < 0).all()),
+        problem, free, floor, cap, count, uniform, fitted, row, output, B, Y, at, bool(record.seen.all()), felt(model), R,
+        bool((problem["kind"] == GAUSSIAN).all() and (w_group < 0).all()),
     )  # fmt: skip
 
 
@@ -374,11 +420,11 @@ def _added(model: Linear, record: Record) -> Array:
     return np.ascontiguousarray(b)
 
 
-def _first_state(model: Linear, record: Record) -> dict[str, Any]:
-    """Return the prior of x0: Gaussian, uniform in a box, or so wide that it says nothing where the box has no end."""
+def _first_state(model: Linear, record: Record) -> tuple[Array, Array, Array]:
+    """Return mean, covariance and half-widths of x0: Gaussian, uniform in a box, or so wide that it says nothing."""
     x0, nx = model.x0, model.nx
     if isinstance(x0, Normal):
-        return {"m0": np.ascontiguousarray(x0.mean), "P0": np.ascontiguousarray(x0.P), "half0": np.zeros(nx)}
+        return np.ascontiguousarray(x0.mean), np.ascontiguousarray(x0.P), np.zeros(nx)
     assert isinstance(x0, Box)
     finite = np.isfinite(x0.lo) & np.isfinite(x0.hi)
     m0, half = np.array(x0.mean), np.where(finite, 0.5 * (x0.hi - x0.lo), 0.0)
@@ -391,7 +437,7 @@ def _first_state(model: Linear, record: Record) -> dict[str, Any]:
         wide = np.maximum(1e3 * base.column[:nx], 10.0 * np.abs(base.X[:nx]))
         m0 = np.where(finite, m0, base.X[:nx])
         P0 = np.diag(np.where(finite, 0.0, wide**2))
-    return {"m0": np.ascontiguousarray(m0, dtype=float), "P0": P0, "half0": half}
+    return np.ascontiguousarray(m0, dtype=float), P0, half
 
 
 @dataclass(frozen=True, eq=False)

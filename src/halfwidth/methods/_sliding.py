@@ -68,6 +68,9 @@ class Solved(NamedTuple):
     variances: Array | None = None
 
 
+_NONE = np.zeros(0)
+
+
 class Forecasts:
     """Where the newest windows expect the state to be now.
 
@@ -252,7 +255,7 @@ class Sliding:
                 return solved
             est = method.answer(model, part, contradiction=False)
         elif self.carried is not None:
-            est = self._posterior(model, part, a)
+            return self._posterior(model, part, a)
         else:
             est = method.run(model, part, seed=self.seed)
         told = ("solver", "objective", "notes", "message", "gap", "half_widths", "variances")
@@ -265,17 +268,18 @@ class Sliding:
             est.status, int(est.info.get("iterations", 0) or 0), info, est.spread, variances,
         )  # fmt: skip
 
-    def _posterior(self, model: Model, part: Record, a: int) -> Estimate:
-        """Estimate one window with what the rows before it told."""
+    def _posterior(self, model: Model, part: Record, a: int) -> Solved:
+        """Solve one window with what the rows before it told."""
         held, method = self.carried, self.window.method
         assert held is not None
         assert isinstance(method, Posterior)
-        seen = np.asarray(part.seen.any(axis=1))
         answer = method.resumed(model, part, held, self.first + a, a, max(len(part) - self.window.lag, 0))
         newest = self.first + len(self.times) - 1
-        rows = max(int(seen.sum()), self.window.memory + 1)
-        held.take(answer, newest, rows, counts=bool(seen[-1]))
-        return answer.estimate
+        rows = max(int(np.count_nonzero(part.seen.any(axis=1))), self.window.memory + 1)
+        held.take(answer, newest, rows, counts=self.since == 0)
+        return Solved(
+            answer.moments[0], _NONE, answer.s, answer.status, 0, answer.said, answer.spread, answer.variances
+        )
 
     def _costs(self, model: Model, part: Record) -> Array:
         """Return the scales of the first full window, or of the rows there are."""

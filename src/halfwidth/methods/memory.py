@@ -28,7 +28,8 @@ from halfwidth.methods._protocol import Estimator
 from halfwidth.methods._sites import Sites, sites
 from halfwidth.methods._sliding import Sliding, Solved
 from halfwidth.methods.map import BatchLP
-from halfwidth.methods.posterior import Answer, Posterior
+from halfwidth.methods._answer import Answer
+from halfwidth.methods.posterior import Posterior
 from halfwidth.methods.sequential import expected, filled
 from halfwidth.methods.window import Window
 from halfwidth.model import Linear, Model

@@ -38,7 +38,8 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
-from halfwidth.methods._carry import HANDED_ON, Carried, Known, Start, condition
+from halfwidth.methods._answer import Answer
+from halfwidth.methods._carry import Carried, Known, Start, condition
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Frame, Sites, frames_of, gaussian_part, sites, uniform_part, unknowns
 from halfwidth.model import Linear, Model, Nonlinear
@@ -73,10 +74,6 @@ _AGAIN = 4
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
 #: Outliers and losses have two explanations for a row: their sites move in smaller steps and need more of them.
 _MIXED = {"most": 20, "few": 8, "damping": 0.5}
-#: Moments that agree this well, in standard deviations, are good, and good enough to be used.
-_FINE, _USABLE = 0.01, 0.1
-#: Fewer effective nodes than this leave an integral over half-widths rough.
-_FEW = 3.0
 #: Beta prior of a contamination rate that is learned.
 _RATE = (1.0, 30.0)
 _MOST_STATES = 16
@@ -277,56 +274,61 @@ class Posterior:
                 quick = replace(self, nodes=1).answer(short, begin)
             except BadShape:  # a noise stacked row by row
                 quick = None
-            if quick is not None and int(quick.found["code"]) < 2:
+            if quick is not None and quick.code < 2:
                 start = Start(np.where(quick.chain.free, quick.start.s, problem.guess))
-        found = self._solve(problem, model, start, drop, known, shaped)
-        return Answer(self._estimate(problem, found, model, record), problem, found, self._rate(model)[0])
+        found, handed, code = self._solve(problem, model, start, drop, known, shaped)
+        return Answer(_typed(self), model, record, problem, found, handed, code, self._rate(model)[0])
 
     def _solve(
         self, chain: Sites, model: Linear, start: Start | None, drop: int, known: Known | None, shaped: int
-    ) -> dict[str, Any]:
-        rate, learn_rate, _ = self._rate(model)
-        first = chain.guess if start is None else start.s.clip(chain.floor, chain.cap)
-        first = np.where(chain.free, first, np.where(chain.floor < chain.cap, chain.floor, chain.cap))
-        q = int(chain.free.sum()) + learn_rate
+    ) -> tuple[_core.EpFound, _core.EpHanded, int]:
+        """Return what the core found, what it hands on, and how it went."""
+        frame = chain.frame
+        first = chain.guess if start is None else np.minimum(np.maximum(start.s, chain.floor), frame.cap)
+        data = (
+            chain.floor, np.maximum(chain.scale, 1e-300), np.where(frame.free, first, frame.known), *chain.data.values(),
+            None if start is None else start.before, drop, shaped, None if known is None else known.values,
+        )  # fmt: skip
+        found, handed = self._learner(chain, model, known is None).learn(*data)
+        code = found["code"]
+        if code == 2 and self.nodes > 1 and found["mode"].size:
+            # A mode in the corner of its bounds may have no node inside them: then it stands alone.
+            found, handed = self._learner(chain, model, known is None, alone=True).learn(*data)
+            code = max(found["code"], 1)
+        return found, handed, code
+
+    def _learner(self, chain: Sites, model: Linear, first: bool, alone: bool = False) -> _core.EpFrame:
+        """Return the chain as the core takes it, `first` where nothing is known of it yet, `alone` with one node."""
+        frame, asked = chain.frame, (self, first, alone, chain.exact)
+        learner = frame.learners.get(asked)
+        if learner is None:
+            learner = frame.learners[asked] = self._made(frame, model, first, alone, chain.exact)
+        return learner
+
+    def _made(self, frame: Frame, model: Linear, first: bool, alone: bool, exact: bool) -> _core.EpFrame:
+        rate, learn_rate, beta = self._rate(model)
+        stages, q = len(frame.problem["start"]) - 1, frame.q + learn_rate
         limits = dict(_LIMITS)
-        limits["condition"] = condition(len(chain.problem["start"]) - 2) if known is None else 0.0  # `known` sees to it
-        limits["again"] = min((len(chain.problem["start"]) - 2) // 8, _AGAIN)
-        rows = max(float(chain.count.sum()), 1.0)
+        limits["condition"] = condition(stages - 1) if first else 0.0  # `known` sees to it
+        limits["again"] = min((stages - 1) // 8, _AGAIN)
+        rows = max(float(frame.count.sum()), 1.0)
         limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
         limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
         if rows > _LONG:
             limits |= _OF_LONG
-        n = len(chain.problem["m0"])
-        room = int(_ROOM / (len(chain.problem["start"]) * n * (n + 3)))
-        count = 1 if q == 0 or self.nodes == 1 else max(min(self.nodes, max(room, _STAGE)), 2 * q + 6)
+        room = int(_ROOM / ((stages + 1) * model.nx * (model.nx + 3)))
+        single = q == 0 or self.nodes == 1 or alone
+        count = 1 if single else max(min(self.nodes, max(room, _STAGE)), 2 * q + 6)
         if q == 0:
             limits |= _KNOWN | {"most": self.iterations}
         if rate > 0 and q:
             limits |= _MIXED
-        if chain.exact:
+        if exact:
             limits["most"] = 1
-        found = self._learn(chain, model, first, start, drop, known, shaped, limits, count)
-        if int(found["code"]) == 2 and q and self.nodes > 1:
-            # A mode in the corner of its bounds may have no node inside them: then it stands alone.
-            found = self._learn(chain, model, first, start, drop, known, shaped, limits, 1)
-            found["code"] = max(int(found["code"]), 1)
-        return found
-
-    def _learn(
-        self, chain: Sites, model: Linear, first: Array, start: Start | None, drop: int, known: Known | None,
-        shaped: int, limits: dict[str, Any], count: int,
-    ) -> dict[str, Any]:  # fmt: skip
-        rate, learn_rate, beta = self._rate(model)
-        z = nodes(int(chain.free.sum()) + learn_rate, count)
-        return dict(
-            _core.ep_learn(
-                chain.problem, chain.free, chain.floor, chain.cap, np.maximum(chain.scale, 1e-300), first, chain.count,
-                chain.fitted, learn_rate, rate, math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z,
-                limits, None if start is None else start.before, drop, shaped,
-                *((None, None, None) if known is None else known),
-                chain.outside if limits["condition"] > 0 else None,
-            )
+        return _core.EpFrame(
+            frame.problem, frame.free, frame.cap, frame.count, frame.fitted, learn_rate, rate,
+            math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, nodes(q, count), limits,
+            frame.outside if limits["condition"] > 0 else None,
         )  # fmt: skip
 
     def _rate(self, model: Linear) -> tuple[float, bool, tuple[float, float]]:
@@ -342,138 +344,10 @@ class Posterior:
             return 0.01, True, _RATE
         return float(self.outliers), False, (1.0, 1.0)
 
-    def _estimate(self, chain: Sites, found: dict[str, Any], model: Linear, record: Record) -> Estimate:
-        nx, residual, K = model.nx, found["residual"], found["nodes"]
-        sound = found["code"] < 2 and found["finite"]
-        info: dict[str, Any] = {"notes": []}
-        loglik: float | None = None
-        if sound:
-            x, P = found["x"], found["P"]
-            widths = {name: found[name] for name in ("mean", "sd", "lo", "hi")}
-            q = found["mode"].size
-            few = found["effective"] < _FEW if K > 1 else found["code"] == 1 and q > 0
-            status = Status.STALLED if residual > _USABLE else Status.REDUCED if residual > _FINE or few else Status.OK
-            loglik = found["log_evidence"] - found["log_prior"] - 0.5 * q * math.log(2 * math.pi)
-        else:
-            status = Status.INFEASIBLE if found["code"] >= 2 else Status.STALLED
-            s = np.where(chain.free, chain.guess, chain.floor)
-            value = np.where(chain.fitted, s**2, s)
-            widths = {"mean": value, "sd": np.zeros_like(s), "lo": value, "hi": value}
-            x, P = self._fallback(chain, s)
-            info["hint"] = "wider half-widths, outliers=True, or missing outputs; BatchLP() names the rows in conflict"
-            info["message"] = (
-                f"{status.value}, or the iteration ran away from it; "
-                "states are those of a Gaussian smoother with the same variances"
-            )
-        within = None
-        if isinstance(model.bounds, Box):
-            within = (np.asarray(model.bounds.lo), np.asarray(model.bounds.hi))
-            x[1:] = np.minimum(np.maximum(x[1:], within[0]), within[1])
-        if (chain.exact and not chain.free.any()) or not sound:
-            spread: Any = Normal.of(x[1:].copy(), P[1:], within)
-        else:
-            spread = Shaped(x[1:].copy(), P[1:], found["k3"][1:], found["k4"][1:], within)
-        gamma = None
-        if found["out"] is not None and not sound and model.loss is None:
-            info |= {"outliers": [], "outlier_probability": np.where(record.seen, 0.0, np.nan)}
-        elif found["out"] is not None:
-            share = np.where(record.seen, 0.0, np.nan)
-            kept = chain.output >= 0
-            share[chain.row[kept], chain.output[kept]] = found["out"][kept]
-            if model.loss is not None:
-                gamma = 1.0 - np.where(record.seen, share, 0.0)
-            else:
-                info["outliers"] = _named(share, model, record)
-                info["outlier_probability"] = share
-        p = nx + model.ny
-        if not chain.count.all():
-            lost = (chain.uniform | chain.fitted) & (chain.floor < chain.cap) & (chain.count == 0)
-            names = np.array([*model.names.x, *model.names.y])
-            for what, part in (("bound", lost[:p]), ("variance", lost[p:])):
-                if part.any():
-                    info["notes"].append(f"{what} not identifiable: " + ", ".join(names[part]))
-        if len(chain.count) > p:
-            info["variances"] = {name: v[p:] for name, v in widths.items()}
-        info |= {
-            "x0": x[0].copy(),
-            "half_widths": {name: v[:p] for name, v in widths.items()},
-            "rate": found["rate"] if sound else None,
-            "residual": residual,
-            "sweeps": found["sweeps"],
-            "nodes": K,
-            "effective": found["effective"] if sound else 0.0,
-        }
-        return Estimate(
-            record.t,
-            x[1:].copy(),
-            spread,
-            status,
-            _typed(self),
-            q=widths["mean"][:nx].copy() if sound and uniform_part(model.w) is not None else None,
-            r=widths["mean"][nx:p].copy() if sound and uniform_part(model.e) is not None else None,
-            Q=widths["mean"][p : p + nx].copy() if sound and chain.fitted[p : p + nx].any() else None,
-            R=widths["mean"][p + nx :].copy() if sound and chain.fitted[p + nx :].any() else None,
-            gamma=gamma,
-            loglik=loglik,
-            names=model.names.x,
-            labels=record.labels,
-            info=info,
-        )
-
-    def _fallback(self, chain: Sites, s: Array) -> tuple[Array, Array]:
-        """Return the moments of the chain with every uniform replaced by a Gaussian of its variance; s (p,)."""
-        problem = dict(chain.problem, half0=np.maximum(chain.problem["half0"], 0.0))
-        s = np.ascontiguousarray(np.where(s > 0, s, 1e-9 * np.maximum(chain.scale, 1e-290))[None])
-        found = _core.ep_run(problem, s, np.zeros(1), 0, 1.0, 1.0, None)
-        x, P = found["x"][0], found["P"][0]
-        bad = ~(np.isfinite(x).all(axis=1) & np.isfinite(P).all(axis=(1, 2)))
-        if bad.any():  # nothing is known there
-            x[bad] = problem["m0"]
-            P[bad] = np.diag(1e6 * np.maximum(chain.scale[: x.shape[1]] ** 2, 1e-12 * problem["m0"] ** 2))
-        return x, P
-
-
-class Answer(NamedTuple):
-    """An estimate, its chain, what the core found, and the rate of outliers or losses if it is told."""
-
-    estimate: Estimate
-    chain: Sites
-    found: dict[str, Any]
-    rate: float
-
-    @property
-    def start(self) -> Start:
-        """Where the mode is, for the next evaluation of this chain or of one that begins some rows later."""
-        s, free, found = self.chain.floor.copy(), self.chain.free, self.found
-        s[free] = np.exp(found["mode"][: np.count_nonzero(free)])
-        before = (self.chain.problem["start"], *found["sites"], *(found[name] for name in HANDED_ON))
-        return Start(np.where(free, s, self.chain.cap), before)
-
-    @property
-    def told(self) -> Known:
-        """What its rows tell of the half-widths."""
-        return Known(*(self.found[name] for name in ("told_pull", "told_precision", "told_power")))
-
 
 @functools.lru_cache(maxsize=64)
 def _typed(method: Posterior) -> str:
     return typed(method)
-
-
-def _named(share: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
-    """Return the outputs that are outliers more likely than not, the surest first."""
-    with np.errstate(invalid="ignore"):
-        rows, columns = np.nonzero(share > 0.5)
-    order = np.argsort(-share[rows, columns], kind="stable")
-    return [
-        {
-            "t": float(record.t[rows[k]]),
-            "row": int(rows[k]),
-            "name": model.names.y[columns[k]],
-            "probability": float(share[rows[k], columns[k]]),
-        }
-        for k in order
-    ]
 
 
 @functools.lru_cache(maxsize=64)
