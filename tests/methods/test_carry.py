@@ -47,7 +47,7 @@ def test_messages_with_matrices_that_vary_and_correlate():
         hw.Normal(np.zeros(3), 1.0), E=E,
     )  # fmt: skip
     answer = hw.Posterior().answer(model, record)
-    found = list(zip(answer.found["edge_x"], answer.found["edge_P"], strict=True))
+    found = list(zip(answer.handed["edge_x"], answer.handed["edge_P"], strict=True))
     kf = hw.estimate(model, record, hw.KalmanFilter())
     np.testing.assert_allclose([x for x, _ in found[1:]], kf.x, atol=1e-9)
     np.testing.assert_allclose([P for _, P in found[1:]], kf.P, atol=1e-9)
@@ -176,9 +176,9 @@ def test_what_a_window_hands_on_equals_the_twin(nodes):
     for name, twin in zip(("mean", "sd", "lo", "hi"), widths, strict=True):
         np.testing.assert_allclose(found[name][free], twin, rtol=1e-10)
     assert found["effective"] == pytest.approx(effective, rel=1e-10)
-    x, P = naive_carry.edge(answer.chain.problem, [found[k] for k in ("m", "D", "tau", "nu")])
-    np.testing.assert_allclose(found["edge_x"], x, atol=1e-11)
-    np.testing.assert_allclose(found["edge_P"], P, atol=1e-11)
+    x, P = naive_carry.edge(answer.chain.problem, [answer.handed[k] for k in ("m", "D", "tau", "nu")])
+    np.testing.assert_allclose(answer.handed["edge_x"], x, atol=1e-11)
+    np.testing.assert_allclose(answer.handed["edge_P"], P, atol=1e-11)
 
 
 def test_sites_go_along_with_their_rows():

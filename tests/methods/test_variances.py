@@ -38,10 +38,11 @@ def test_mode_without_a_prior_is_maximum_likelihood(seed):
     chain = sites(asked(), record)
     z = posterior.nodes(4, 1)
     limits = posterior._LIMITS | {"condition": 0.0, "close": 1e-10, "steps": 60, "reference": 0.0, "again": 0}
-    found = _core.ep_learn(
-        chain.problem, chain.free, chain.floor, chain.cap, chain.scale, chain.guess, chain.count, chain.fitted, False, 0.0,
-        -14.0, posterior.WARP, 1.0, 1.0, z, limits,
+    learner = _core.EpFrame(
+        chain.frame.problem, chain.free, chain.cap, chain.count, chain.frame.fitted, False, 0.0, -14.0, posterior.WARP, 1.0,
+        1.0, z, limits,
     )  # fmt: skip
+    found, _ = learner.learn(chain.floor, chain.scale, chain.guess, **chain.data)
 
     def cost(phi):
         v = np.exp(2 * phi)
@@ -94,7 +95,7 @@ def test_told_variances_give_the_same_as_known_ones(name):
         told.append(given if box is None else (box if box.known else hw.Uniform(0.4)) + given)
     known = hw.estimate(asked(*told), record, hw.Posterior())
     chain = sites(asked(*noise), record)
-    s = np.where(chain.fitted, np.sqrt(0.1), np.where(chain.uniform, 0.4, 0.0))
+    s = np.where(chain.frame.fitted, np.sqrt(0.1), np.where(chain.frame.uniform, 0.4, 0.0))
     s = np.where(chain.floor == chain.cap, chain.floor, s)
     found = run(chain, s)
     np.testing.assert_allclose(found["x"][0, 1:], known.x, atol=1e-6)

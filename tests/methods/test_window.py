@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import halfwidth as hw
-from halfwidth.methods._sliding import rows_since_fix, window_starts
+from halfwidth.methods._rows import rows_since_fix, window_starts
 from halfwidth.reproduce import paper003
 
 UNKNOWN = hw.Uniform.unknown(at_most=10.0)

@@ -1,4 +1,4 @@
-"""What `Posterior` makes of a window that the core has solved: an `Estimate`, or the parts of one that are asked for."""
+"""What `Posterior` makes of a chain that the core has solved: an `Estimate`, or the parts that are asked for."""
 
 from functools import cached_property
 from typing import Any
@@ -107,7 +107,7 @@ class Answer:
 
     @property
     def variances(self) -> Array | None:
-        """Means of the variances of noises where some are unknown, (nx + ny,), NaN elsewhere; None if there are none."""
+        """Means of the variances where some are unknown, (nx + ny,), NaN elsewhere; None if there are none."""
         p, fitted = self.model.nx + self.model.ny, self.chain.frame.fitted
         if not self.sound or not fitted.any():
             return None

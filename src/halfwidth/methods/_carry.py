@@ -211,7 +211,7 @@ class Carried:
         d = P.diagonal()
         if not (math.isfinite(x.sum() + P.sum()) and d.min() > 0):
             return None
-        P.flat[:: len(x) + 1] *= 1.0 + 1e-12
+        P.flat[:: len(x) + 1] += 1e-12 * d
         return Normal.of(x, P)
 
     def take(self, answer: "Answer", newest: int, rows: int, *, counts: bool) -> None:

@@ -18,8 +18,8 @@ from halfwidth.result import Estimate, Status
 from halfwidth.spread import Shaped
 
 if TYPE_CHECKING:
-    from halfwidth.methods._carry import Start
     from halfwidth.methods._answer import Answer
+    from halfwidth.methods._carry import Start
     from halfwidth.methods.posterior import Posterior
 
 _STEPS = 40

@@ -14,7 +14,7 @@ from halfwidth.methods._boxes import Boxes, far_back
 from halfwidth.methods._conflict import conflict_of
 from halfwidth.methods._functional import Bound, functional_of
 from halfwidth.methods._protocol import pushed_row
-from halfwidth.methods._sliding import window_starts
+from halfwidth.methods._rows import window_starts
 from halfwidth.methods.hull import FIXES, PROPOSERS, STRETCH, Hull, answer, middle, names_of, outer
 from halfwidth.model import Linear
 from halfwidth.record import Labels

@@ -20,8 +20,8 @@ from halfwidth.spread import Normal
 from halfwidth.trace import Untraceable, compiled
 
 if TYPE_CHECKING:
-    from halfwidth.methods._carry import Known, Start
     from halfwidth.methods._answer import Answer
+    from halfwidth.methods._carry import Known, Start
     from halfwidth.methods.posterior import Posterior
 
 #: A step below this share of the standard deviations ends the iteration, and one below the second is good enough.

@@ -298,8 +298,8 @@ def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame
         of = np.abs(Y).argmax(axis=1)
         Y, at = Y[np.arange(len(Y)), of], at * ny + of
     return Frame(
-        problem, free, floor, cap, count, uniform, fitted, row, output, B, Y, at, bool(record.seen.all()), felt(model), R,
-        bool((problem["kind"] == GAUSSIAN).all() and (w_group < 0).all()),
+        problem, free, floor, cap, count, uniform, fitted, row, output, B, Y, at, bool(record.seen.all()), felt(model),
+        R, bool((problem["kind"] == GAUSSIAN).all() and (w_group < 0).all()),
     )  # fmt: skip
 
 

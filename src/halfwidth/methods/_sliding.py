@@ -19,20 +19,20 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from halfwidth.array import Array
+from halfwidth.methods._ahead import Forecasts
 from halfwidth.methods._carry import Carried
 from halfwidth.methods._protocol import Estimator, pushed_row, typed
 from halfwidth.methods._residuals import reference, residuals
+from halfwidth.methods._rows import Rows
 from halfwidth.methods._sites import groups
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.posterior import Posterior
 from halfwidth.methods.sequential import (
     SequentialLP,
-    expected,
     filled,
-    growth,
     half_width_bounds,
     rows_of,
     scaled_costs,
@@ -71,174 +71,112 @@ class Solved(NamedTuple):
 _NONE = np.zeros(0)
 
 
-class Forecasts:
-    """Where the newest windows expect the state to be now.
-
-    Each window's newest state moves along with the model. The half-widths are estimates of what the state may stray by
-    in a step: since the last fix their largest among these windows adds up, as bounds do. Where they are 0, as optimal
-    ones often are, nothing adds up.
-
-    Attributes
-    ----------
-    x, q : (n, nx) arrays
-        Expected states, half-widths of the state noise.
-    grown : (nx,) array
-        What has added up.
-    """
-
-    def __init__(self, nx: int) -> None:
-        self.x, self.q, self.grown = np.zeros((0, nx)), np.zeros((0, nx)), np.zeros(nx)
-
-    def move(self, model: Model, record: Record, k: int, x: Array) -> Array:
-        """Move on to row k; returns what is expected after x, the estimate of the row before."""
-        moved = expected(model, record, k, np.concatenate((x[None], self.x)))
-        if len(self.q):
-            self.grown = growth(model, record, k, x, self.grown, self.q.max(axis=0))
-        if isinstance(model.bounds, Box):
-            moved = np.minimum(np.maximum(moved, model.bounds.lo), model.bounds.hi)
-        self.x = moved[1:]
-        return np.asarray(moved[0])
-
-    def take(self, x: Array, q: Array, memory: int) -> None:
-        """Add the estimate of a window that ends in a fix."""
-        self.x, self.q = (
-            np.concatenate((self.x, x[None]))[-memory - 1 :],
-            np.concatenate((self.q, q[None]))[-memory - 1 :],
-        )
-        self.grown = np.zeros_like(self.grown)
-
-    def bounds(self) -> tuple[Array, Array, int]:
-        """Return the least and the largest, and of how many windows."""
-        if not len(self.x):
-            return np.full_like(self.grown, -np.inf), np.full_like(self.grown, np.inf), 0
-        return self.x.min(axis=0) - self.grown, self.x.max(axis=0) + self.grown, len(self.x)
-
-
 class Sliding:
     """A window fed row by row: it keeps the rows that the next window may need, nothing else.
 
     Attributes
     ----------
-    first : int
-        Number of the first row held.
-    times, y, u : (n,), (n, ny), (n, nu) arrays
-        The rows held.
-    x, low, high : (n + 1, nx) arrays
-        Newest, least and largest estimate of each state held: the one before the first row, then one a row.
+    held : Rows
+    pushed : int
+        Rows that came in so far.
+    t : float
+        Time of the newest row.
+    since : int
+        Rows since any output was seen.
     """
 
     def __init__(self, window: "Window", model: Model, t: float, seed: int | None = None) -> None:
         self.window, self.model, self.seed = window, model, seed
-        self.t, self.before = t, t  # time of the newest row, and of the one before the first held
-        self.first = self.pushed = 0
-        self.times, self.y, self.u = np.zeros(0), np.zeros((0, model.ny)), np.zeros((0, model.nu))
-        self.seen = np.zeros((0, model.ny), dtype=bool)
-        self.x = np.array(model.x0.mean, dtype=float)[None]
-        self.low, self.high = np.full((1, model.nx), np.inf), np.full((1, model.nx), -np.inf)
-        self.knows = not getattr(model, "theta_entries", ()) or isinstance(window.method, SequentialLP)
-        self.used = np.zeros(model.ny, dtype=bool)  # outputs seen before the first row held
-        self.edge = np.ones(model.ny, dtype=bool)  # ... and in the row right before it
-        self.since = 0  # rows since any output was seen
-        self.ahead = Forecasts(model.nx)
+        self.t, self.pushed, self.since = t, 0, 0
+        self.held = Rows(np.array(model.x0.mean, dtype=float), model.ny, model.nu, t)
+        entries = getattr(model, "theta_entries", ())
+        self.knows = not entries or isinstance(window.method, SequentialLP)
+        self.ahead = Forecasts(model, window.memory)
         self.theta = np.zeros(0)
         self.costs: Array | None = None
         self.start: Start | None = None
         self.last: Solved | None = None
         self.carried = carried_of(window, model)
+        matrices = model.matrices if isinstance(model, Linear) else {}
+        self._stacks = {k: m.value for k, m in matrices.items() if m.value is not None and m.value.ndim == 3}
+        self._always = not isinstance(window.method, BatchLP | SequentialLP)
+
+    @property
+    def first(self) -> int:
+        """Number of the first row held."""
+        return self.held.first
+
+    @property
+    def x(self) -> Array:
+        """Newest estimates of the states held, (n + 1, nx); `low` and `high` are the least and the largest."""
+        return self.held.x
+
+    @property
+    def low(self) -> Array:
+        """As `x`."""
+        return self.held.low
+
+    @property
+    def high(self) -> Array:
+        """As `x`."""
+        return self.held.high
 
     def push(self, y: Array, u: Array | None, dt: float) -> Solved:
         """Fold one row in: solve the window that ends in it."""
-        window, model = self.window, self.model
+        window, held, method = self.window, self.held, self.window.method
         self.t += dt
-        self.times = np.concatenate((self.times, (self.t,)))
-        self.y = np.concatenate((self.y, y[None]))
-        self.seen = seen = np.concatenate((self.seen, ~np.isnan(y)[None]))
-        if u is not None:
-            self.u = np.concatenate((self.u, u[None]))
         self.pushed += 1
-        a = int(window_starts(seen, window.memory, fixes=window.fixes, stretch=window.stretch)[-1])
-        last = window_lasts(seen, window.memory, self.used, self.edge)  # by place: the first is before the rows held
-        part = Record.of(self.times[a:], self.y[a:], self.u[a:] if model.nu else None, seen[a:])
+        self.since = 0 if held.append(self.t, y, u) else self.since + 1
+        a = held.start(window.memory, window.fixes, window.stretch)
+        part = Record.of(held.times[a:], held.y[a:], held.u[a:] if self.model.nu else None, held.seen[a:])
         if self.carried is not None:
             self.carried.leave(a)
-        local = self._local(a, len(self.times) - 1 >= last[a])
-        self.since = 0 if seen[-1].any() else self.since + 1
-        method = window.method
+        local = self._local(a)
         if self.last is None and isinstance(method, SequentialLP):
             self.theta = start_theta(rows_of(local, part, method.drift), method.theta)
         known = local
         if isinstance(local, Linear) and isinstance(method, SequentialLP):
             known = filled(local, self.theta[: len(local.theta_entries)])
-        newest = self.ahead.move(known, part, len(part) - 1, self.x[-1]) if self.knows else self.x[-1]
-        self.x = np.concatenate((self.x, newest[None]))
-        fresh = self.since == 0 or self.last is None or not isinstance(method, BatchLP | SequentialLP)
-        if fresh:
+        newest, x = len(part) - 1, held.x[-2]
+        held.x[-1] = self.ahead.move(known, part, newest, x) if self.knows else x
+        taken = False
+        if self.since == 0 or self.last is None or self._always:
+            x = x.copy()
             solved = self._solve(local, part, a)
-            self._note_all(a, solved.x, last)
+            held.note(a, solved.x, window.memory)
             if self.since == 0 and self.knows and solved.status.good:
-                q = solved.s[: model.nx]
-                self.ahead.take(solved.x[-1], np.where(np.isnan(q), 0.0, q), window.memory)
+                self.ahead.take(solved.x[-1], half_widths_of(solved.s, self.model.nx))
+                taken = True
         else:
             assert self.last is not None
-            solved = self.last._replace(x=self.x[a:].copy(), iterations=0)
-            self._note(len(self.x) - 1, self.x[-1], last)
+            solved = self.last._replace(x=held.x[a:].copy(), iterations=0)
+            held.note_newest(held.x[-1])
+        if self.knows and not taken:
+            self.ahead.grow(known, part, newest, x)
         self.last = solved
-        self._forget(a)
+        held.forget(a)
         return solved
 
     def back(self) -> int:
         """Return how many rows ago the state is that is asked for: `lag`, or that of the first row."""
         return min(self.window.lag, self.pushed - 1)
 
-    def _note_all(self, a: int, x: Array, last: NDArray[np.int32]) -> None:
-        """Note the estimates x of the states from a on; the newest one has none so far."""
-        held = len(self.low) - a
-        low, high = self.low[a:], self.high[a:]
-        if len(self.times) - 1 <= last[a : a + held].min():
-            low, high = np.minimum(low, x[:held]), np.maximum(high, x[:held])
-        else:
-            open_ = (len(self.times) - 1 <= last[a : a + held])[:, None]
-            low, high = (
-                np.where(open_, np.minimum(low, x[:held]), low),
-                np.where(open_, np.maximum(high, x[:held]), high),
-            )
-        self.low = np.concatenate((self.low[:a], low, x[held:]))
-        self.high = np.concatenate((self.high[:a], high, x[held:]))
-        self.x[a:] = x
-
-    def _note(self, k: int, x: Array, last: NDArray[np.int32]) -> None:
-        self.x[k] = x
-        if k == len(self.low):
-            self.low, self.high = np.concatenate((self.low, x[None])), np.concatenate((self.high, x[None]))
-        elif len(self.times) - 1 <= last[k]:
-            self.low[k], self.high[k] = np.minimum(self.low[k], x), np.maximum(self.high[k], x)
-
-    def _forget(self, a: int) -> None:
-        """Let go of the first a rows held: starts never move back."""
-        if a == 0:
-            return
-        self.before = float(self.times[a - 1])
-        self.used, self.edge = self.used | self.seen[:a].any(axis=0), self.seen[a - 1]
-        self.first += a
-        self.times, self.y, self.u, self.seen = self.times[a:], self.y[a:], self.u[a:], self.seen[a:]
-        self.x, self.low, self.high = self.x[a:], self.low[a:], self.high[a:]
-
-    def _local(self, a: int, finished: bool) -> Model:
+    def _local(self, a: int) -> Model:
         """Return the model of the rows from a on: stacked matrices cut, the box of its first state."""
-        changes: dict[str, Any] = {"dt": float(self.times[a] - (self.times[a - 1] if a else self.before))}
-        model, rows = self.model, slice(self.first + a, self.first + len(self.times))
-        if isinstance(model, Linear):
-            for name, matrix in model.matrices.items():
-                if matrix.value is not None and matrix.value.ndim == 3:
-                    changes[name] = matrix.value[rows]
+        held, model = self.held, self.model
+        rows = slice(held.first + a, held.first + len(held))
+        changes: dict[str, Any] = {k: value[rows] for k, value in self._stacks.items()}
+        changes["dt"] = float(held.times[a]) - (float(held.times[a - 1]) if a else held.before)
         if rows.start > 0 and self.carried is not None and self.carried.first is not None:
             changes["x0"] = self.carried.first
         elif rows.start > 0 and (isinstance(model.x0, Box) or self.carried is not None):
             free = Box(np.full(model.nx, -np.inf), np.full(model.nx, np.inf))
             box = model.bounds if isinstance(model.bounds, Box) else free
-            held = interval(self.low[a], self.high[a], self.window.memory, self.window.carry) if finished else None
-            changes["x0"] = box if held is None else meet(box, held)
-        if changes.keys() <= {"dt", "x0"}:  # both judged already
+            memory, carry = self.window.memory, self.window.carry
+            finished = carry is not None and held.over(len(held), memory) > a
+            given = interval(held.low[a], held.high[a], memory, carry) if finished else None
+            changes["x0"] = box if given is None else meet(box, given)
+        if not self._stacks:  # both judged already
             local = object.__new__(type(model))
             local.__dict__.update(model.__dict__, **changes)
             return local
@@ -263,7 +201,7 @@ class Sliding:
         s = _both(est.q, est.r, model)
         variances = None if est.Q is None and est.R is None else _both(est.Q, est.R, model)
         return Solved(
-            np.concatenate((est.info.get("x0", self.x[a])[None], est.x)),
+            np.concatenate((est.info.get("x0", self.held.x[a])[None], est.x)),
             np.zeros(0) if est.theta is None else est.theta, s,
             est.status, int(est.info.get("iterations", 0) or 0), info, est.spread, variances,
         )  # fmt: skip
@@ -273,8 +211,8 @@ class Sliding:
         held, method = self.carried, self.window.method
         assert held is not None
         assert isinstance(method, Posterior)
-        answer = method.resumed(model, part, held, self.first + a, a, max(len(part) - self.window.lag, 0))
-        newest = self.first + len(self.times) - 1
+        answer = method.resumed(model, part, held, self.held.first + a, a, max(len(part) - self.window.lag, 0))
+        newest = self.held.first + len(self.held) - 1
         rows = max(int(np.count_nonzero(part.seen.any(axis=1))), self.window.memory + 1)
         held.take(answer, newest, rows, counts=self.since == 0)
         return Solved(
@@ -310,7 +248,7 @@ class Sliding:
     def _linearised(self, method: SequentialLP, model: Model, part: Record, a: int) -> Solved:
         """Solve the window about the one before: its states, the newest one as the model expects it, and its theta."""
         rows: Any = rows_of(model, part, method.drift)
-        x, theta = self.x[a:].copy(), self.theta
+        x, theta = self.held.x[a:].copy(), self.theta
         c = np.ones(rows.groups)
         if isinstance(model, Nonlinear) or method.objective == "log" or method.point == "least_squares":
             early = self.pushed <= self.window.memory
@@ -351,14 +289,13 @@ class Sliding:
         def plain(rows: Any) -> Any:
             return [[None if not math.isfinite(v) else v for v in row] for row in rows]
 
-        last = self.last
+        last, held = self.last, self.held
         return {
-            "t": self.t, "before": self.before, "first": self.first, "pushed": self.pushed,
-            "times": self.times.tolist(),
-            "y": plain(self.y), "u": plain(self.u), "x": plain(self.x), "low": plain(self.low),
-            "high": plain(self.high), "used": self.used.tolist(),
-            "edge": self.edge.tolist(), "since": self.since,
-            "ahead": [plain(self.ahead.x), plain(self.ahead.q), self.ahead.grown.tolist()],
+            "t": self.t, "before": held.before, "first": held.first, "pushed": self.pushed,
+            "times": held.times.tolist(),
+            "y": plain(held.y), "u": plain(held.u), "x": plain(held.x), "low": plain(held.low),
+            "high": plain(held.high), "used": held.used.tolist(),
+            "edge": held.edge.tolist(), "since": self.since, "ahead": self.ahead.save(),
             "theta": self.theta.tolist(), "costs": None if self.costs is None else self.costs.tolist(),
             "start": None if self.start is None else [part.tolist() for part in self.start],
             "carried": None if self.carried is None else self.carried.save(),
@@ -376,20 +313,14 @@ class Sliding:
         def arrays(rows: Any, lost: float = math.nan) -> list[Array]:
             return [np.array([lost if v is None else v for v in row], dtype=float) for row in rows]
 
-        self.t, self.before = float(saved["t"]), float(saved["before"])
-        self.first, self.pushed = int(saved["first"]), int(saved["pushed"])
-        self.times = np.array(saved["times"], dtype=float)
-        nx, ny, nu = self.model.nx, self.model.ny, self.model.nu
-        self.y, self.u = (np.array(arrays(saved[k])).reshape(len(saved[k]), n) for k, n in (("y", ny), ("u", nu)))
-        self.seen = ~np.isnan(self.y)
-        self.x, self.low, self.high = (
-            np.array(arrays(saved[k], lost)) for k, lost in (("x", math.nan), ("low", math.inf), ("high", -math.inf))
-        )
-        self.used, self.edge = np.array(saved["used"], dtype=bool), np.array(saved["edge"], dtype=bool)
-        self.since = int(saved["since"])
-        x, q, grown = saved["ahead"]
-        self.ahead.x, self.ahead.q = np.array(x, dtype=float).reshape(-1, nx), np.array(q, dtype=float).reshape(-1, nx)
-        self.ahead.grown = np.array(grown, dtype=float)
+        held, nx, ny, nu = self.held, self.model.nx, self.model.ny, self.model.nu
+        self.t, self.pushed, self.since = float(saved["t"]), int(saved["pushed"]), int(saved["since"])
+        held.before, held.first = float(saved["before"]), int(saved["first"])
+        held.used, held.edge = np.array(saved["used"], dtype=bool), np.array(saved["edge"], dtype=bool)
+        y, u = (np.array(arrays(saved[k])).reshape(len(saved[k]), n) for k, n in (("y", ny), ("u", nu)))
+        states = [np.array(arrays(saved[k], v)) for k, v in (("x", math.nan), ("low", math.inf), ("high", -math.inf))]
+        held.put(np.array(saved["times"], dtype=float), y, u, ~np.isnan(y), *states)
+        self.ahead.load(saved["ahead"])
         self.theta = np.array(saved["theta"], dtype=float)
         self.costs = None if saved["costs"] is None else np.array(saved["costs"], dtype=float)
         self.start = None
@@ -406,7 +337,7 @@ class Sliding:
             theta, s, status, v = saved["last"]
             variances = None if v is None else arrays([v])[0]
             self.last = Solved(
-                np.array(self.x), np.array(theta, dtype=float), arrays([s])[0], Status[status], 0, {}, None, variances
+                held.x.copy(), np.array(theta, dtype=float), arrays([s])[0], Status[status], 0, {}, None, variances
             )
 
 
@@ -416,9 +347,14 @@ def _both(of_w: Array | None, of_e: Array | None, model: Model) -> Array:
     return np.concatenate(parts)
 
 
+def half_widths_of(s: Array, nx: int) -> list[float]:
+    """Return those of the states from all of a window, 0 where there is none."""
+    return [v if v == v else 0.0 for v in s[:nx].tolist()]
+
+
 def if_found(values: Array, status: Status) -> Array | None:
     """Return a copy of half-widths or variances that a window found, None where it found none."""
-    return values.copy() if status.good and bool(np.isfinite(values).all()) else None
+    return values.copy() if status.good and all(map(math.isfinite, values.tolist())) else None
 
 
 def stacked(spreads: list[Spread | None]) -> Spread | None:
@@ -463,12 +399,12 @@ class Live:
 
     def push(self, y: ArrayLike | None, u: ArrayLike | None = None, dt: float | None = None) -> Estimate:
         """Fold one row in and return the newest estimate."""
-        held = self._rows
-        model = held.model
-        solved = held.push(*pushed_row(model, y, u, dt))
-        low, high, windows = held.ahead.bounds()
+        rows = self._rows
+        model, held = rows.model, rows.held
+        solved = rows.push(*pushed_row(model, y, u, dt))
+        low, high, windows = rows.ahead.bounds()
         nx, v = model.nx, solved.variances
-        back = held.back()
+        back = rows.back()
         ago = slice(-1 - back, -back or None)
         return Estimate(
             held.times[ago].copy(),
@@ -484,8 +420,8 @@ class Live:
             names=model.names.x,
             info=solved.info
             | {
-                "iterations": solved.iterations, "extrapolated": held.since > 0, "since_fix": held.since,
-                "rows": len(held.times),
+                "iterations": solved.iterations, "extrapolated": rows.since > 0, "since_fix": rows.since,
+                "rows": len(held),
                 "newest_low": low[None], "newest_high": high[None], "newest_windows": np.array([windows]),
             },
         )  # fmt: skip
@@ -499,69 +435,7 @@ class Live:
         self._rows.load(json.loads(saved))
 
 
-# ---- which rows a window holds ---------------------------------------------------------------------------------------
-
-
-def window_starts(
-    seen: NDArray[np.bool_], memory: int, *, fixes: int = 10, stretch: int | None = None
-) -> NDArray[np.int32]:
-    """Return the first row of the window that ends at each row, (T,).
-
-    A window holds the newest `memory` + 1 rows in which any output is seen, and reaches further back until every output
-    that has been seen so far has `fixes` (at most `memory` + 1) seen entries in it, but at most `stretch` rows.
-    """
-    T, ny = seen.shape
-    rows = np.arange(T)
-    if seen.all():
-        return np.maximum(rows - memory, 0).astype(np.int32)
-    places = np.flatnonzero(seen.any(axis=1))
-    before = np.searchsorted(places, rows, side="right")  # rows with a seen output up to and with each row
-    start = np.where(before > memory, np.r_[places, 0][np.maximum(before - memory - 1, 0)], 0)
-    for j in range(ny if fixes else 0):
-        places = np.flatnonzero(seen[:, j])
-        before = np.searchsorted(places, rows, side="right")
-        # An output with fewer entries than asked for is taken back to its first one.
-        first = np.r_[places, 0][np.maximum(before - min(fixes, memory + 1), 0)]
-        start = np.where(before > 0, np.minimum(start, first), start)
-    if stretch is not None:
-        start = np.maximum(start, rows - stretch + 1)
-    return start.astype(np.int32)
-
-
-def window_lasts(
-    seen: NDArray[np.bool_],
-    memory: int,
-    used: NDArray[np.bool_] | None = None,
-    edge: NDArray[np.bool_] | None = None,
-) -> NDArray[np.int32]:
-    """Return the row whose window is the last to be part of each state's interval, (T + 1,); state 0 is before row 0.
-
-    It is `memory` rows after the state, and after the end of every gap that the state lies in: within a gap all windows
-    extrapolate from the same rows and agree, whatever they miss. `used` says which outputs were seen before row 0,
-    `edge` which of them in the row before it.
-    """
-    T, ny = seen.shape
-    rows = np.arange(T)
-    if seen.all():
-        last = np.arange(memory - 1, T + memory, dtype=np.int32)
-        if used is not None and edge is not None:
-            last[0] += bool((used & ~edge).any())
-        return last
-    end, first = rows.copy(), -1
-    for j in range(ny):
-        later = np.minimum.accumulate(np.where(seen[:, j], rows, T - 1)[::-1])[::-1]
-        there = np.logical_or.accumulate(seen[:, j]) | (used is not None and bool(used[j]))
-        end = np.maximum(end, np.where(there, later, rows))
-        if used is not None and edge is not None and used[j] and not edge[j]:
-            first = max(first, int(later[0]))
-    return np.asarray(np.r_[first, end] + memory, dtype=np.int32)
-
-
-def rows_since_fix(seen: NDArray[np.bool_]) -> NDArray[np.int_]:
-    """Return how many rows ago any output was last seen, (T,); 0 where one is seen now."""
-    rows = np.arange(len(seen))
-    last = np.maximum.accumulate(np.where(seen.any(axis=1), rows, -1))
-    return rows - last
+# ---- the first state of a window -------------------------------------------------------------------------------------
 
 
 def interval(low: Array, high: Array, memory: int, carry: float | None) -> Box | None:

@@ -36,7 +36,7 @@ from halfwidth.methods._bounds import Rows, interval_rows, not_bounded
 from halfwidth.methods._boxes import Boxes, Empty, Proposer, stock
 from halfwidth.methods._conflict import Conflict, conflict_of
 from halfwidth.methods._protocol import typed
-from halfwidth.methods._sliding import window_starts
+from halfwidth.methods._rows import window_starts
 from halfwidth.methods.sets import ZonotopeFilter
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Uniform

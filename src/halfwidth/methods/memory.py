@@ -24,11 +24,11 @@ import numpy as np
 import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadValue
+from halfwidth.methods._answer import Answer
 from halfwidth.methods._protocol import Estimator
 from halfwidth.methods._sites import Sites, sites
 from halfwidth.methods._sliding import Sliding, Solved
 from halfwidth.methods.map import BatchLP
-from halfwidth.methods._answer import Answer
 from halfwidth.methods.posterior import Posterior
 from halfwidth.methods.sequential import expected, filled
 from halfwidth.methods.window import Window

@@ -30,7 +30,7 @@ import functools
 import math
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -45,8 +45,7 @@ from halfwidth.methods._sites import Frame, Sites, frames_of, gaussian_part, sit
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
-from halfwidth.result import Estimate, Status
-from halfwidth.spread import Box, Normal, Shaped
+from halfwidth.result import Estimate
 
 #: Power of the half-widths' prior; see above.
 POWER = 0.4
@@ -286,7 +285,8 @@ class Posterior:
         frame = chain.frame
         first = chain.guess if start is None else np.minimum(np.maximum(start.s, chain.floor), frame.cap)
         data = (
-            chain.floor, np.maximum(chain.scale, 1e-300), np.where(frame.free, first, frame.known), *chain.data.values(),
+            chain.floor, np.maximum(chain.scale, 1e-300), np.where(frame.free, first, frame.known),
+            chain.m0, chain.P0, chain.half0, chain.b, chain.y,
             None if start is None else start.before, drop, shaped, None if known is None else known.values,
         )  # fmt: skip
         found, handed = self._learner(chain, model, known is None).learn(*data)

@@ -37,19 +37,10 @@ from numpy.typing import NDArray
 import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadValue, Refused
+from halfwidth.methods._ahead import Forecasts
 from halfwidth.methods._protocol import Estimator, typed
-from halfwidth.methods._sliding import (
-    TOL,
-    Forecasts,
-    Live,
-    Sliding,
-    first_costs,
-    if_found,
-    rows_since_fix,
-    stacked,
-    window_lasts,
-    window_starts,
-)
+from halfwidth.methods._rows import rows_since_fix, window_lasts, window_starts
+from halfwidth.methods._sliding import TOL, Live, Sliding, first_costs, if_found, stacked
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.sequential import expected, half_width_bounds
 from halfwidth.model import Linear, Model
@@ -184,12 +175,14 @@ class Window:
                 box = model.bounds
                 filtered[k] = np.clip(moved, box.lo, box.hi) if isinstance(box, Box) else moved
                 found.statuses[k], s[k] = answer.status, answer.s
-        ahead = Forecasts(model.nx)
+        ahead = Forecasts(model, memory)
         for t in range(len(record)):
             if t:
                 ahead.move(model, record, t, filtered[t - 1])
             if seen[t] and found.statuses[t].good:
-                ahead.take(filtered[t], s[t, : model.nx], memory)
+                ahead.take(filtered[t], s[t, : model.nx])
+            elif t:
+                ahead.grow(model, record, t, filtered[t - 1])
             found.newest_low[t], found.newest_high[t], found.newest_windows[t] = ahead.bounds()
         return found
 

@@ -294,7 +294,7 @@ def table_three(*, quick: bool = False) -> Table:
 
 def central_gain(*, quick: bool = False) -> Table:
     """Filter error of the central point beside the optimal point and a simplex vertex."""
-    from halfwidth.methods._sliding import window_starts
+    from halfwidth.methods._rows import window_starts
     from halfwidth.methods.window import window_chain
     from halfwidth.solvers.lp import HIGHS, solve
 

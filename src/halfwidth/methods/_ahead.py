@@ -1,0 +1,94 @@
+"""Where the newest windows of a stream expect the state to be now."""
+
+from typing import Any
+
+import numpy as np
+
+from halfwidth.array import Array
+from halfwidth.methods.sequential import expected, growth
+from halfwidth.model import Linear, Model
+from halfwidth.record import Record
+from halfwidth.spread import Box
+
+
+class Forecasts:
+    """Where the newest windows expect the state to be now.
+
+    Each window's newest state moves along with the model. The half-widths are estimates of what the state may stray by
+    in a step: since the last fix their largest among these windows adds up, as bounds do. Where they are 0, as optimal
+    ones often are, nothing adds up.
+    """
+
+    def __init__(self, model: Model, memory: int) -> None:
+        nx = model.nx
+        # row 0 is the newest estimate, the others those of windows, one written over the oldest when all are in use
+        self._x, self._q = np.zeros((memory + 2, nx)), np.zeros((memory + 1, nx))
+        self._taken = self._count = 0
+        self.grown = np.zeros(nx)
+        self._step = _constant_step(model)
+        self._box = (model.bounds.lo, model.bounds.hi) if isinstance(model.bounds, Box) else None
+
+    def move(self, model: Model, record: Record, k: int, x: Array) -> Array:
+        """Move on to row k; returns what is expected after x, the estimate of the row before."""
+        held = self._x[: self._count + 1]
+        held[0] = x
+        if self._step is None:
+            moved = expected(model, record, k, held)
+        else:
+            A, B = self._step
+            moved = held @ A
+            if B is not None and record.u is not None:
+                moved += record.u[k] @ B
+        if self._box is not None:
+            np.maximum(moved, self._box[0], out=moved)
+            np.minimum(moved, self._box[1], out=moved)
+        held[:] = moved
+        return held[0]
+
+    def grow(self, model: Model, record: Record, k: int, x: Array) -> None:
+        """No window ends here: what states may stray by adds up; x as in `move`."""
+        if self._count:
+            self.grown = growth(model, record, k, x, self.grown, self._q[: self._count].max(axis=0))
+
+    def take(self, x: Array, q: Array | list[float]) -> None:
+        """Add the estimate of a window that ends in a fix, and its half-widths."""
+        at = self._taken % len(self._q)
+        self._x[1 + at], self._q[at] = x, q
+        self._taken += 1
+        self._count = min(self._taken, len(self._q))
+        self.grown = np.zeros_like(self.grown)
+
+    def bounds(self) -> tuple[Array, Array, int]:
+        """Return the least and the largest, and of how many windows."""
+        n = self._count
+        if n == 0:
+            return np.full_like(self.grown, -np.inf), np.full_like(self.grown, np.inf), 0
+        x = self._x[1 : n + 1]
+        return np.minimum.reduce(x) - self.grown, np.maximum.reduce(x) + self.grown, n
+
+    def save(self) -> list[Any]:
+        """Return all of it as plain numbers, the oldest window first."""
+        first = self._taken % len(self._q) if self._count == len(self._q) else 0
+        return [
+            *(np.roll(v[: self._count], -first, axis=0).tolist() for v in (self._x[1:], self._q)), self.grown.tolist()
+        ]  # fmt: skip
+
+    def load(self, saved: list[Any]) -> None:
+        """Take up what `save` returned."""
+        x, q, grown = saved
+        self._taken = self._count = len(x)
+        if x:
+            self._x[1 : len(x) + 1], self._q[: len(q)] = x, q
+        self.grown = np.array(grown, dtype=float)
+
+
+def _constant_step(model: Model) -> tuple[Array, Array | None] | None:
+    """Return (E^-1 A)' and (E^-1 B)' of a model whose matrices are constant and known."""
+    if not isinstance(model, Linear) or any(m is not None and not m.constant for m in (model.A, model.B, model.E)):
+        return None
+    A, B = model.A.single, None if model.B is None else model.B.single
+    if model.E is not None:
+        A, B = np.linalg.solve(model.E.single, A), None if B is None else np.linalg.solve(model.E.single, B)
+    if np.isnan(A).any() or (B is not None and np.isnan(B).any()):
+        return None
+    return np.ascontiguousarray(A.T), None if B is None else np.ascontiguousarray(B.T)
