@@ -18,6 +18,7 @@ void bind_hull(nb::module_& m);
 void bind_constrain(nb::module_& m);
 void bind_noise(nb::module_& m);
 void bind_ep(nb::module_& m);
+void bind_window(nb::module_& m);
 void bind_sampler(nb::module_& m);
 void bind_mixed(nb::module_& m);
 
@@ -40,6 +41,7 @@ NB_MODULE(_core, m) {
     bind_constrain(m);
     bind_noise(m);
     bind_ep(m);
+    bind_window(m);
     bind_sampler(m);
     bind_mixed(m);
 }

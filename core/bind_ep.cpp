@@ -15,6 +15,7 @@
 #include <vector>
 
 #include "ep_entry.hpp"
+#include "window.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -272,6 +273,15 @@ class EpHanded : public EpArrays {
     std::size_t stages() const { return start.size() - 1; }
 };
 
+// mean and covariance of x_a given what lies up to it, if they are those of a proper Gaussian
+nb::object state(const EpHanded& h, std::size_t a) {
+    if (a >= h.stages()) return nb::none();
+    double *x = nullptr, *P = nullptr;
+    nb::object found_x = fresh({h.n}, &x, h.edge_x + a * h.n), found_P = fresh({h.n, h.n}, &P, h.edge_P + a * h.n * h.n);
+    if (!hw::window_state(h.n, x, P)) return nb::none();
+    return nb::make_tuple(found_x, found_P);
+}
+
 constexpr const char* handed_names[] = {"m", "D", "tau", "nu", "lanes", "lane_phi", "mode", "H", "edge_x", "edge_P"};
 
 nb::tuple save(nb::handle self) {
@@ -304,8 +314,8 @@ void load(EpHanded* into, const std::vector<std::int32_t>& start, std::size_t n,
     h->since = since;
 }
 
-// What a window found: x, P, k3, k4 of the states; out (rows,); of half-widths mean, sd, lo, hi and `told`: pull, precision and
-// power, one after the other; of nodes phi, log_weight, slope, second; mode and H; numbers.
+// What a window found: x, P, k3, k4 of the states; out (rows,); of half-widths `widths`: mean, sd, lo, hi, and `told`: pull, precision
+// and power, one after the other; of nodes phi, log_weight, slope, second; mode and H; numbers.
 class EpFound : public EpArrays {
   public:
     int code = 0, nodes = 0, since = 0;
@@ -489,10 +499,7 @@ class EpFrame {
         found.add("P", {stages, n, n}, &l.P);
         found.add("k3", {stages, n}, &l.k3);
         found.add("k4", {stages, n}, &l.k4);
-        found.add("mean", {groups}, &l.mean);
-        found.add("sd", {groups}, &l.sd);
-        found.add("lo", {groups}, &l.quantile_lo);
-        found.add("hi", {groups}, &l.quantile_hi);
+        found.add("widths", {4, groups}, &l.mean);
         found.add("told", {groups * (groups + 2)}, &told);
         found.add("mode", {q_}, &l.mode);
         found.add("H", {q_, q_}, &l.H);
@@ -502,6 +509,9 @@ class EpFrame {
         found.add("second", {nodes}, &l.second);
         if (outliers) found.add("out", {rows}, &l.out);
         found.make();
+        l.sd = l.mean + groups;
+        l.quantile_lo = l.sd + groups;
+        l.quantile_hi = l.quantile_lo + groups;
         l.told_pull = told;
         l.told_precision = told + groups;
         l.told_power = l.told_precision + groups * groups;
@@ -591,6 +601,7 @@ void bind_ep(nb::module_& mod) {
             "What is known of the free half-widths alone, whatever the others are; see core/ep_handover.hpp.");
     nb::class_<EpHanded>(mod, "EpHanded", "What the next window of a stream may take up; see core/ep_handover.hpp.")
         .def("__init__", &load, "start"_a, "n"_a, "q"_a, "columns"_a, "log_mode"_a, "log_prior"_a, "since"_a, "arrays"_a)
+        .def("state", &state, "a"_a, "Mean and covariance of x_a given what lies up to it, None where they are no Gaussian's.")
         .def("save", &save, "All of it, as the arguments of another one.")
         .def("__getitem__", [](nb::handle self, const char* name) {
             nb::object found = nb::inst_ptr<EpHanded>(self)->get(name, self);

@@ -455,17 +455,18 @@ class Cloud:
 
 
 def part(spread: Spread | None, rows: slice) -> Spread | None:
-    """Return the spread of some rows of an answer."""
+    """Return the spread of some rows of an answer, which does not hold the others in memory."""
+    if isinstance(spread, Shaped):
+        mean, P, skew, kurt = spread.mean[rows], spread.P[rows], spread.skew[rows], spread.kurt[rows]
+        return Shaped(mean.copy(), P.copy(), skew.copy(), kurt.copy(), spread.within)
+    if isinstance(spread, Normal):
+        return Normal.of(spread.mean[rows].copy(), spread.P[rows].copy(), spread._within)
     if isinstance(spread, Box):
         return Box(spread.lo[rows], spread.hi[rows], guaranteed=spread.guaranteed)
-    if isinstance(spread, Normal):
-        return Normal.of(spread.mean[rows], spread.P[rows], spread._within)
-    if isinstance(spread, Shaped):
-        return Shaped(spread.mean[rows], spread.P[rows], spread.skew[rows], spread.kurt[rows], spread.within)
     if isinstance(spread, Both):
-        return Both(spread.mean[rows], spread.P[rows], spread.half[rows])
+        return Both(spread.mean[rows].copy(), spread.P[rows].copy(), spread.half[rows].copy())
     if isinstance(spread, Cloud):
-        return Cloud(spread.points[rows], spread.weights[rows])
+        return Cloud(spread.points[rows].copy(), spread.weights[rows].copy())
     return None
 
 

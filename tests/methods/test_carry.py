@@ -173,8 +173,8 @@ def test_what_a_window_hands_on_equals_the_twin(nodes):
     for ours, twin in zip(answer.told, naive_carry.told(free, found, (known.precision, known.power)), strict=True):
         np.testing.assert_allclose(ours, twin, rtol=1e-7, atol=1e-7 * np.abs(twin).max())
     *widths, effective = naive_carry.widths(free, found)
-    for name, twin in zip(("mean", "sd", "lo", "hi"), widths, strict=True):
-        np.testing.assert_allclose(found[name][free], twin, rtol=1e-10)
+    for ours, twin in zip(found["widths"], widths, strict=True):
+        np.testing.assert_allclose(ours[free], twin, rtol=1e-10)
     assert found["effective"] == pytest.approx(effective, rel=1e-10)
     x, P = naive_carry.edge(answer.chain.problem, [answer.handed[k] for k in ("m", "D", "tau", "nu")])
     np.testing.assert_allclose(answer.handed["edge_x"], x, atol=1e-11)

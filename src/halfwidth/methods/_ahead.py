@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.methods.sequential import expected, growth
 from halfwidth.model import Linear, Model
@@ -24,9 +25,10 @@ class Forecasts:
         # row 0 is the newest estimate, the others those of windows, one written over the oldest when all are in use
         self._x, self._q = np.zeros((memory + 2, nx)), np.zeros((memory + 1, nx))
         self._taken = self._count = 0
-        self.grown = np.zeros(nx)
+        self.grown = self._none = np.zeros(nx)
         self._step = _constant_step(model)
-        self._box = (model.bounds.lo, model.bounds.hi) if isinstance(model.bounds, Box) else None
+        bounds = model.bounds
+        self._box = (bounds.lo, bounds.hi) if isinstance(bounds, Box) else (None, None)
 
     def move(self, model: Model, record: Record, k: int, x: Array) -> Array:
         """Move on to row k; returns what is expected after x, the estimate of the row before."""
@@ -34,15 +36,11 @@ class Forecasts:
         held[0] = x
         if self._step is None:
             moved = expected(model, record, k, held)
+            if self._box[0] is not None:
+                moved = np.minimum(np.maximum(moved, self._box[0]), self._box[1])
+            held[:] = moved
         else:
-            A, B = self._step
-            moved = held @ A
-            if B is not None and record.u is not None:
-                moved += record.u[k] @ B
-        if self._box is not None:
-            np.maximum(moved, self._box[0], out=moved)
-            np.minimum(moved, self._box[1], out=moved)
-        held[:] = moved
+            _core.window_forecast(held, *self._step, None if record.u is None else record.u[k], *self._box)
         return held[0]
 
     def grow(self, model: Model, record: Record, k: int, x: Array) -> None:
@@ -56,15 +54,15 @@ class Forecasts:
         self._x[1 + at], self._q[at] = x, q
         self._taken += 1
         self._count = min(self._taken, len(self._q))
-        self.grown = np.zeros_like(self.grown)
+        self.grown = self._none
 
     def bounds(self) -> tuple[Array, Array, int]:
-        """Return the least and the largest, and of how many windows."""
+        """Return the least and the largest, each (1, nx), and of how many windows."""
         n = self._count
         if n == 0:
-            return np.full_like(self.grown, -np.inf), np.full_like(self.grown, np.inf), 0
-        x = self._x[1 : n + 1]
-        return np.minimum.reduce(x) - self.grown, np.maximum.reduce(x) + self.grown, n
+            return np.full((1, len(self.grown)), -np.inf), np.full((1, len(self.grown)), np.inf), 0
+        low, high = _core.window_ends(self._x[1 : n + 1], self.grown)
+        return low, high, n
 
     def save(self) -> list[Any]:
         """Return all of it as plain numbers, the oldest window first."""
@@ -83,7 +81,7 @@ class Forecasts:
 
 
 def _constant_step(model: Model) -> tuple[Array, Array | None] | None:
-    """Return (E^-1 A)' and (E^-1 B)' of a model whose matrices are constant and known."""
+    """Return E^-1 A and E^-1 B of a model whose matrices are constant and known."""
     if not isinstance(model, Linear) or any(m is not None and not m.constant for m in (model.A, model.B, model.E)):
         return None
     A, B = model.A.single, None if model.B is None else model.B.single
@@ -91,4 +89,4 @@ def _constant_step(model: Model) -> tuple[Array, Array | None] | None:
         A, B = np.linalg.solve(model.E.single, A), None if B is None else np.linalg.solve(model.E.single, B)
     if np.isnan(A).any() or (B is not None and np.isnan(B).any()):
         return None
-    return np.ascontiguousarray(A.T), None if B is None else np.ascontiguousarray(B.T)
+    return np.ascontiguousarray(A), None if B is None else np.ascontiguousarray(B)

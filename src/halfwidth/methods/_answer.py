@@ -18,6 +18,7 @@ from halfwidth.spread import Box, Normal, Shaped, Spread
 _FINE, _USABLE = 0.01, 0.1
 #: Fewer effective nodes than this leave an integral over half-widths rough.
 _FEW = 3.0
+_WIDTHS = ("mean", "sd", "lo", "hi")
 
 
 class Answer:
@@ -44,6 +45,15 @@ class Answer:
         self.method, self.model, self.record, self.chain = method, model, record, chain
         self.found, self.handed, self.code, self.rate = found, handed, code, rate
         self.sound = code < 2 and found["finite"]
+        bounds = model.bounds
+        self.within = (bounds.lo, bounds.hi) if isinstance(bounds, Box) else None
+        self.x, self.P = (found["x"], found["P"]) if self.sound else self._fallback()
+        if self.within is not None:
+            inside = self.x[1:]
+            np.minimum(np.maximum(inside, self.within[0], out=inside), self.within[1], out=inside)
+        # mean, sd, and ends of 90 % of the half-widths, and of the variances that are unknown, each (p,)
+        self.widths = found["widths"].copy() if self.sound else self._no_widths()
+        self.status = self._status()
 
     def amended(self, estimate: Estimate) -> "Answer":
         """Return the same with another estimate, which may differ in status and message."""
@@ -53,9 +63,7 @@ class Answer:
         other.__dict__.update(self.__dict__, estimate=estimate, status=estimate.status, said=said)
         return other
 
-    @cached_property
-    def status(self) -> Status:
-        """How it went."""
+    def _status(self) -> Status:
         found = self.found
         if not self.sound:
             return Status.INFEASIBLE if self.code >= 2 else Status.STALLED
@@ -65,36 +73,13 @@ class Answer:
         few = found["effective"] < _FEW if found["nodes"] > 1 else self.code == 1 and found["mode"].size > 0
         return Status.REDUCED if residual > _FINE or few else Status.OK
 
-    @cached_property
-    def within(self) -> tuple[Array, Array] | None:
-        """Ends of the box that the states are known to lie in."""
-        bounds = self.model.bounds
-        return (bounds.lo, bounds.hi) if isinstance(bounds, Box) else None
-
-    @cached_property
-    def moments(self) -> tuple[Array, Array]:
-        """Means (T + 1, nx) and covariances of x_0 .. x_T."""
-        x, P = (self.found["x"], self.found["P"]) if self.sound else self._fallback()
-        if self.within is not None:
-            np.minimum(np.maximum(x[1:], self.within[0]), self.within[1], out=x[1:])
-        return x, P
-
-    @cached_property
+    @property
     def spread(self) -> Spread:
         """Spread of the rows of the record."""
-        x, P = self.moments
+        x, P = self.x[1:], self.P[1:]
         if not self.sound or (not self.chain.frame.q and self.chain.exact):
-            return Normal.of(x[1:], P[1:], self.within)
-        return Shaped(x[1:], P[1:], self.found["k3"][1:], self.found["k4"][1:], self.within)
-
-    @cached_property
-    def widths(self) -> dict[str, Array]:
-        """Mean, sd, and ends of 90 % of the half-widths, and of the variances that are unknown, each (p,)."""
-        if self.sound:
-            return {name: self.found[name] for name in ("mean", "sd", "lo", "hi")}
-        s = self._unfound
-        value = np.where(self.chain.frame.fitted, s**2, s)
-        return {"mean": value, "sd": np.zeros_like(s), "lo": value, "hi": value}
+            return Normal.of(x, P, self.within)
+        return Shaped(x, P, self.found["k3"][1:], self.found["k4"][1:], self.within)
 
     @property
     def s(self) -> Array:
@@ -102,30 +87,31 @@ class Answer:
         p, uniform = self.model.nx + self.model.ny, self.chain.frame.uniform
         if not self.sound:
             return np.full(p, np.nan)
-        mean: Array = self.widths["mean"][:p]
-        return mean if uniform.all() else np.where(uniform[:p], mean, np.nan)
+        mean = self.widths[0, :p]
+        return mean if self.chain.frame.bounded else np.where(uniform[:p], mean, np.nan)
 
     @property
     def variances(self) -> Array | None:
         """Means of the variances where some are unknown, (nx + ny,), NaN elsewhere; None if there are none."""
         p, fitted = self.model.nx + self.model.ny, self.chain.frame.fitted
-        if not self.sound or not fitted.any():
+        if len(fitted) == p or not self.sound:
             return None
-        return np.where(fitted[p:], self.widths["mean"][p:], np.nan)
+        return np.where(fitted[p:], self.widths[0, p:], np.nan)
 
     @cached_property
     def said(self) -> dict[str, Any]:
         """What a row of a stream tells of its window."""
-        p, frame = self.model.nx + self.model.ny, self.chain.frame
+        p, frame, widths = self.model.nx + self.model.ny, self.chain.frame, self.widths
         info: dict[str, Any] = {"notes": self._notes(p) if frame.unseen else []}
         if not self.sound:
             info["message"] = (
                 f"{self.status.value}, or the iteration ran away from it; "
                 "states are those of a Gaussian smoother with the same variances"
             )
-        if len(frame.count) > p:
-            info["variances"] = {name: v[p:] for name, v in self.widths.items()}
-        info["half_widths"] = {name: v[:p] for name, v in self.widths.items()}
+        if widths.shape[1] > p:
+            info["variances"] = dict(zip(_WIDTHS, widths[:, p:], strict=True))
+            widths = widths[:, :p]
+        info["half_widths"] = dict(zip(_WIDTHS, widths, strict=True))
         return info
 
     def _notes(self, p: int) -> list[str]:
@@ -158,7 +144,7 @@ class Answer:
                 info |= {"outliers": _named(share, model, record), "outlier_probability": share}
             else:
                 gamma = 1.0 - np.where(record.seen, share, 0.0)
-        x, mean = self.moments[0], self.widths["mean"]
+        x, mean = self.x, self.widths[0]
         info |= {
             "x0": x[0].copy(),
             "rate": found["rate"] if sound else None,
@@ -205,6 +191,11 @@ class Answer:
     @property
     def _unfound(self) -> Array:
         return np.where(self.chain.free, self.chain.guess, self.chain.floor)
+
+    def _no_widths(self) -> Array:
+        s = self._unfound
+        value = np.where(self.chain.frame.fitted, s**2, s)
+        return np.array([value, np.zeros_like(s), value, value])
 
     def _fallback(self) -> tuple[Array, Array]:
         """Return the moments of the chain with every uniform replaced by a Gaussian of its variance."""

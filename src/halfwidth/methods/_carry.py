@@ -198,21 +198,9 @@ class Carried:
 
     def leave(self, a: int) -> None:
         """Let go of the first a rows of the newest window: they tell the state that the next one begins at."""
-        self.first = self._state(a) if a else self.first
-
-    def _state(self, a: int) -> Normal | None:
-        """Return what is known of the state after the first a rows by all up to it."""
-        if self._newest is None:
-            return None
-        x, P = self._newest["edge_x"], self._newest["edge_P"]
-        if len(x) <= a:
-            return None
-        x, P = x[a].copy(), P[a].copy()
-        d = P.diagonal()
-        if not (math.isfinite(x.sum() + P.sum()) and d.min() > 0):
-            return None
-        P.flat[:: len(x) + 1] += 1e-12 * d
-        return Normal.of(x, P)
+        if a:
+            state = None if self._newest is None else self._newest.state(a)
+            self.first = None if state is None else Normal.of(*state)
 
     def take(self, answer: "Answer", newest: int, rows: int, *, counts: bool) -> None:
         """Keep what a window told: its newest row's number, its number of rows, and whether it told anything new."""

@@ -87,13 +87,15 @@ def pushed_row(
     step = model.dt if dt is None else float(dt)
     if not step > 0 or not math.isfinite(step):
         raise BadRecord(f"`dt` is {dt!r}, a positive number of seconds was expected")
-    row = np.full(model.ny, np.nan) if y is None else np.atleast_1d(np.array(y, dtype=float))
-    if row.shape != (model.ny,) or np.isinf(row).any():
+    row = np.full(model.ny, np.nan) if y is None else np.array(y, dtype=float, ndmin=1)
+    if row.shape != (model.ny,) or any(map(math.isinf, row.tolist())):
         raise BadRecord(f"`y` is {y!r}, {model.ny} numbers were expected; None or NaN is missing")
-    inputs = None if u is None else np.atleast_1d(np.array(u, dtype=float))
-    if (0 if inputs is None else inputs.size) != model.nu or (inputs is not None and not np.isfinite(inputs).all()):
+    if u is None and model.nu == 0:
+        return row, None, step
+    inputs = np.zeros(0) if u is None else np.array(u, dtype=float, ndmin=1)
+    if inputs.size != model.nu or not all(map(math.isfinite, inputs.ravel().tolist())):
         raise BadRecord(f"`u` is {u!r}, {model.nu} finite numbers were expected")
-    return row, inputs, step
+    return row, None if u is None else inputs, step
 
 
 def typed(method: Any) -> str:

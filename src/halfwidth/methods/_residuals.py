@@ -20,6 +20,8 @@ Redundancy and variance components: Förstner (1979), Ein Verfahren zur Schätzu
 """
 
 import functools
+import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -253,19 +255,15 @@ def scales(effect: Array, seen: Sequence[Array]) -> Array:
 
 def scales_of_steps(effect: Array, steps: Sequence[float], seen: Sequence[Array]) -> Array:
     """Return the same from the typical step of each output."""
-    ny, nx = effect.shape
-    sigma, weight = np.ones(nx + ny), np.zeros(ny)
-    for j, (level, y) in enumerate(zip(steps, seen, strict=True)):
-        if not level > 0 and len(y):
-            level = float(np.std(y))
-        level = level if level > 0 else 1.0
-        sigma[nx + j] = level
-        if len(y):
-            weight[j] = 1.0 / level**2
-    gram = weight @ effect
-    told = gram > 0
-    sigma[:nx][told] = 1.0 / np.sqrt(gram[told])
-    return sigma
+    size, weight = [], []
+    for step, y in zip(steps, seen, strict=True):
+        if not step > 0:
+            level = float(np.std(y)) if len(y) else 0.0
+            step = level if level > 0 else 1.0
+        size.append(step)
+        weight.append(1.0 / step**2 if len(y) else 0.0)
+    gram = [sum(map(operator.mul, weight, column)) for column in effect.T.tolist()]
+    return np.array([1.0 / math.sqrt(g) if g > 0 else 1.0 for g in gram] + size)
 
 
 def felt(model: Linear) -> Array:

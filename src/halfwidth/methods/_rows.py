@@ -6,6 +6,7 @@ Most streams bring rows in which every output is seen; while all rows held are s
 import numpy as np
 from numpy.typing import NDArray
 
+import halfwidth._core as _core
 from halfwidth.array import Array
 
 #: Rows that there is room for beyond twice those held: when it is used up those held are moved to the front.
@@ -91,9 +92,7 @@ class Rows:
         """Take the estimates x of the states from a on; the newest one has none so far."""
         n = len(self)
         b = max(a, self.over(n - 1, memory))
-        low, high, new = self.low[b:n], self.high[b:n], x[b - a : n - a]
-        np.minimum(low, new, out=low)
-        np.maximum(high, new, out=high)
+        _core.window_note(x[b - a : n - a], self.low[b:n], self.high[b:n])
         self.x[a:] = x
         self.low[n] = self.high[n] = x[-1]
 

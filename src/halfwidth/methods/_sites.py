@@ -120,6 +120,11 @@ class Frame:
         return np.where(self.floor < self.cap, self.floor, self.cap)
 
     @cached_property
+    def bounded(self) -> bool:
+        """Whether every entry has a half-width."""
+        return bool(self.uniform.all())
+
+    @cached_property
     def unseen(self) -> bool:
         """Whether a group has no row."""
         return not self.count.all()

@@ -215,9 +215,7 @@ class Sliding:
         newest = self.held.first + len(self.held) - 1
         rows = max(int(np.count_nonzero(part.seen.any(axis=1))), self.window.memory + 1)
         held.take(answer, newest, rows, counts=self.since == 0)
-        return Solved(
-            answer.moments[0], _NONE, answer.s, answer.status, 0, answer.said, answer.spread, answer.variances
-        )
+        return Solved(answer.x, _NONE, answer.s, answer.status, 0, answer.said, answer.spread, answer.variances)
 
     def _costs(self, model: Model, part: Record) -> Array:
         """Return the scales of the first full window, or of the rows there are."""
@@ -422,7 +420,7 @@ class Live:
             | {
                 "iterations": solved.iterations, "extrapolated": rows.since > 0, "since_fix": rows.since,
                 "rows": len(held),
-                "newest_low": low[None], "newest_high": high[None], "newest_windows": np.array([windows]),
+                "newest_low": low, "newest_high": high, "newest_windows": np.array([windows]),
             },
         )  # fmt: skip
 
