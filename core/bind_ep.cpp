@@ -314,7 +314,7 @@ void load(EpHanded* into, const std::vector<std::int32_t>& start, std::size_t n,
     h->since = since;
 }
 
-// What a window found: x, P, k3, k4 of the states; out (rows,); of half-widths `widths`: mean, sd, lo, hi, and `told`: pull, precision
+// What a window found: x, P, k3, k4 of the states; out (rows,); of half-widths `s`: at the mode, `widths`: mean, sd, lo, hi, and `told`: pull, precision
 // and power, one after the other; of nodes phi, log_weight, slope, second; mode and H; numbers.
 class EpFound : public EpArrays {
   public:
@@ -448,8 +448,11 @@ class EpFrame {
         want(floor.size() == groups && scale.size() == groups && start.size() == groups, "floor, scale, start (groups,)");
         want(shaped >= 0, "shaped: a stage");
         l.floor = floor.data();
-        l.scale = scale.data();
-        l.start = start.data();
+        std::vector<double> own(2 * groups);
+        for (std::size_t g = 0; g < groups; g++) own[g] = std::max(scale.data()[g], 1e-300);
+        hw::window_first(groups, l.free, l.floor, l.cap, start.data(), own.data() + groups);
+        l.scale = own.data();
+        l.start = l.scale + groups;
         l.shaped = shaped;
         if (known) {
             want(known->size() == groups * (groups + 2), "known: pull (groups,), precision (groups,groups), power (groups,)");
@@ -494,12 +497,13 @@ class EpFrame {
             l.before = &old;
         }
         const bool outliers = l.learn_eps || l.rate > 0.0;
-        double* told = nullptr;
+        double *told = nullptr, *mode = nullptr;
         found.add("x", {stages, n}, &l.x);
         found.add("P", {stages, n, n}, &l.P);
         found.add("k3", {stages, n}, &l.k3);
         found.add("k4", {stages, n}, &l.k4);
         found.add("widths", {4, groups}, &l.mean);
+        found.add("s", {groups}, &mode);
         found.add("told", {groups * (groups + 2)}, &told);
         found.add("mode", {q_}, &l.mode);
         found.add("H", {q_, q_}, &l.H);
@@ -558,6 +562,7 @@ class EpFrame {
             l.base.work = work.p;
             found.code = HW_PICK_WIDE(ep_learn)(l);
         }
+        hw::window_mode(groups, l.free, l.cap, l.mode, mode);
         found.with_rate = l.learn_eps;
         handed.log_prior = found.log_prior;
         handed.log_mode = found.log_mode;

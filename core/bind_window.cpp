@@ -2,6 +2,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/vector.h>
 
 #include <optional>
 #include <stdexcept>
@@ -15,6 +16,7 @@ using namespace nb::literals;
 namespace {
 
 using In = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+using Column = nb::ndarray<const double, nb::ndim<1>, nb::device::cpu>;
 using InOut = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 void want(bool ok, const char* what) {
@@ -45,11 +47,27 @@ void note(In x, InOut low, InOut high) {
     hw::window_note(x.size(), x.data(), low.data(), high.data());
 }
 
+nb::object sizes(In effect, const std::vector<Column>& seen) {
+    const std::size_t ny = seen.size(), nx = ny ? effect.size() / ny : 0;
+    want(effect.ndim() == 2 && effect.size() == nx * ny && effect.shape(0) == ny, "effect (ny,nx), seen: ny arrays");
+    const std::size_t shape[1] = {nx + ny};
+    double* found = new double[nx + ny];
+    nb::capsule owner(found, [](void* p) noexcept { delete[] static_cast<double*>(p); });
+    std::vector<std::size_t> counts(ny);
+    for (std::size_t j = 0; j < ny; j++) {
+        counts[j] = seen[j].size();
+        found[nx + j] = hw::window_size(counts[j], seen[j].stride(0), seen[j].data());
+    }
+    hw::window_sizes(nx, ny, effect.data(), counts.data(), found + nx, found);
+    return nb::cast(nb::ndarray<nb::numpy, double>(found, 1, shape, owner));
+}
+
 }  // namespace
 
 void bind_window(nb::module_& mod) {
     mod.def("window_forecast", &forecast, "x"_a, "A"_a, "B"_a.none(), "u"_a.none(), "lo"_a.none(), "hi"_a.none(),
             "Move states along a linear model, in place; see core/window.hpp.");
     mod.def("window_ends", &ends, "x"_a, "grown"_a, "Least and largest of rows of states, moved apart, as (2, 1, n).");
+    mod.def("window_sizes", &sizes, "effect"_a, "seen"_a, "Order of size of each state and output, by the seen outputs.");
     mod.def("window_note", &note, "x"_a, "low"_a, "high"_a, "Let low and high take in x, in place.");
 }

@@ -61,6 +61,22 @@ inline void ep_eigen(int n, double* A, double* V) {
     }
 }
 
+// Whether A (n,n), symmetric with a diagonal of about 1, is safely positive definite; L (n,n)
+inline bool ep_definite(int n, const double* A, double* L) {
+    for (int j = 0; j < n; j++) {
+        double pivot = A[j * n + j];
+        for (int k = 0; k < j; k++) pivot -= L[j * n + k] * L[j * n + k];
+        if (!(pivot > 1e-6)) return false;
+        L[j * n + j] = std::sqrt(pivot);
+        for (int i = j + 1; i < n; i++) {
+            double s = A[i * n + j];
+            for (int k = 0; k < j; k++) s -= L[i * n + k] * L[j * n + k];
+            L[i * n + j] = s / L[j * n + j];
+        }
+    }
+    return true;
+}
+
 // What is known of the free ones of p half-widths alone, whatever the others are, as a proper Gaussian: found_pull (p,),
 // found_precision (p,p), 0 at the others. work (4 p^2 + 4 p)
 inline void ep_known(int p, const bool* free, const double* pull, const double* precision, double* found_pull,
@@ -113,6 +129,13 @@ inline void ep_known(int p, const bool* free, const double* pull, const double* 
     }
     for (int i = 0; i < f; i++)
         for (int j = 0; j < f; j++) A[i * f + j] = 0.5 * (H[i * f + j] + H[j * f + i]) / (unit[i] * unit[j]);
+    if (ep_definite(f, A, V)) {  // proper as it is
+        for (int i = 0; i < f; i++) {
+            found_pull[old(i)] = h[i];
+            for (int j = 0; j < f; j++) found_precision[old(i) * p + old(j)] = 0.5 * (H[i * f + j] + H[j * f + i]);
+        }
+        return;
+    }
     ep_eigen(f, A, V);
     for (int k = 0; k < f; k++) {
         turned[k] = 0.0;

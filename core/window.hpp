@@ -60,4 +60,38 @@ inline bool window_state(std::size_t n, const double* x, double* P) {
     return good;
 }
 
+// Size of an output y (count,), of this stride: its mean step from one to the next, else its standard deviation, else 1.
+inline double window_size(std::size_t count, std::ptrdiff_t stride, const double* y) {
+    double sum = 0.0, square = 0.0;
+    for (std::size_t k = 1; k < count; k++) sum += std::fabs(y[stride * k] - y[stride * (k - 1)]);
+    if (sum > 0.0) return sum / (count - 1);
+    for (std::size_t k = 0; k < count; k++) sum += y[stride * k];
+    for (std::size_t k = 0; k < count; k++) square += (y[stride * k] - sum / count) * (y[stride * k] - sum / count);
+    square = count ? std::sqrt(square / count) : 0.0;
+    return square > 0.0 ? square : 1.0;
+}
+
+// Sizes of the states, (nx,), by those of the outputs that have counts: what moves them by as much; effect (ny,nx)
+inline void window_sizes(std::size_t nx, std::size_t ny, const double* effect, const std::size_t* counts, const double* outputs, double* states) {
+    for (std::size_t i = 0; i < nx; i++) {
+        double gram = 0.0;
+        for (std::size_t j = 0; j < ny; j++)
+            if (counts[j]) gram += effect[j * nx + i] / (outputs[j] * outputs[j]);
+        states[i] = gram > 0.0 ? 1.0 / std::sqrt(gram) : 1.0;
+    }
+}
+
+// Where a search for half-widths begins, (p,): at `start` within its bounds, others at what they are.
+inline void window_first(std::size_t p, const bool* free, const double* floor, const double* cap, const double* start, double* first) {
+    for (std::size_t g = 0; g < p; g++) {
+        const double s = start[g] > floor[g] ? start[g] : floor[g];
+        first[g] = free[g] ? (s < cap[g] ? s : cap[g]) : floor[g] < cap[g] ? floor[g] : cap[g];
+    }
+}
+
+// Half-widths at the mode, (p,): those that are not free at their caps. mode (free,) holds logarithms
+inline void window_mode(std::size_t p, const bool* free, const double* cap, const double* mode, double* s) {
+    for (std::size_t g = 0, j = 0; g < p; g++) s[g] = free[g] ? std::exp(mode[j++]) : cap[g];
+}
+
 }  // namespace hw

@@ -178,10 +178,7 @@ class Answer:
     @property
     def start(self) -> Start:
         """Where the mode is, for the next evaluation of this chain or of one that begins some rows later."""
-        frame = self.chain.frame
-        s = frame.cap.copy()
-        s[frame.free] = np.exp(self.found["mode"][: frame.q])
-        return Start(s, self.handed)
+        return Start(self.found["s"], self.handed)
 
     @property
     def told(self) -> Known:

@@ -20,8 +20,6 @@ Redundancy and variance components: Förstner (1979), Ein Verfahren zur Schätzu
 """
 
 import functools
-import math
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -29,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.model import Linear
 from halfwidth.record import Record
@@ -244,26 +243,7 @@ def first_scales(model: Linear, seen: Sequence[Array]) -> Array:
     seen : sequence of arrays
         The seen values of each output, in order.
     """
-    return scales(felt(model), seen)
-
-
-def scales(effect: Array, seen: Sequence[Array]) -> Array:
-    """Return the first scales of a model with this `felt`."""
-    steps = [float(np.abs(y[1:] - y[:-1]).sum()) / max(len(y) - 1, 1) for y in seen]
-    return scales_of_steps(effect, steps, seen)
-
-
-def scales_of_steps(effect: Array, steps: Sequence[float], seen: Sequence[Array]) -> Array:
-    """Return the same from the typical step of each output."""
-    size, weight = [], []
-    for step, y in zip(steps, seen, strict=True):
-        if not step > 0:
-            level = float(np.std(y)) if len(y) else 0.0
-            step = level if level > 0 else 1.0
-        size.append(step)
-        weight.append(1.0 / step**2 if len(y) else 0.0)
-    gram = [sum(map(operator.mul, weight, column)) for column in effect.T.tolist()]
-    return np.array([1.0 / math.sqrt(g) if g > 0 else 1.0 for g in gram] + size)
+    return _core.window_sizes(felt(model), seen)  # type: ignore[no-any-return]
 
 
 def felt(model: Linear) -> Array:

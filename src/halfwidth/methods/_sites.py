@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.methods._residuals import _eliminate, felt, reference, residuals, scales, scales_of_steps
+from halfwidth.methods._residuals import _eliminate, felt, reference, residuals
 from halfwidth.model import Linear, Model
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
 from halfwidth.record import Record
@@ -113,11 +113,6 @@ class Frame:
         rows = {k: np.ascontiguousarray(p[k][keep]) for k in ("h", "kind", "group", "R", "lo", "hi")}
         before = np.concatenate([[0], np.cumsum(keep)])
         return p | rows | {"lost": None, "mix": None, "group_R": None, "start": before[p["start"]].astype(np.int32)}
-
-    @cached_property
-    def known(self) -> Array:
-        """The groups that are not free, (p,)."""
-        return np.where(self.floor < self.cap, self.floor, self.cap)
 
     @cached_property
     def bounded(self) -> bool:
@@ -218,11 +213,8 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
         frame = frames.get(kept)
     y = record.y if frame is not None and frame.whole else np.where(record.seen, record.y, 0.0)
     effect = felt(model) if frame is None else frame.felt
-    if frame is not None and frame.whole:
-        steps = np.abs(y[1:] - y[:-1]).sum(axis=0) / max(len(y) - 1, 1)
-        scale = scales_of_steps(effect, steps.tolist(), y.T)  # type: ignore[arg-type]
-    else:
-        scale = scales(effect, [record.y[record.seen[:, j], j] for j in range(model.ny)])
+    whole = frame is not None and frame.whole
+    scale = _core.window_sizes(effect, list(y.T) if whole else [v[there] for v, there in zip(y.T, record.seen.T)])
     if frame is None or not frame.fits(scale, y):
         frame = _frame(model, record, scale, outliers)
         if frames is not None and kept and _constant(model) and frame.fits(scale, y):

@@ -284,10 +284,8 @@ class Posterior:
         self, chain: Sites, model: Linear, start: Start | None, drop: int, known: Known | None, shaped: int
     ) -> tuple[_core.EpFound, _core.EpHanded, int]:
         """Return what the core found, what it hands on, and how it went."""
-        frame = chain.frame
-        first = chain.guess if start is None else np.minimum(np.maximum(start.s, chain.floor), frame.cap)
         data = (
-            chain.floor, np.maximum(chain.scale, 1e-300), np.where(frame.free, first, frame.known),
+            chain.floor, chain.scale, chain.guess if start is None else start.s,
             chain.m0, chain.P0, chain.half0, chain.b, chain.y,
             None if start is None else start.before, drop, shaped, None if known is None else known.values,
         )  # fmt: skip
