@@ -60,15 +60,11 @@ inline bool window_state(std::size_t n, const double* x, double* P) {
     return good;
 }
 
-// Size of an output y (count,), of this stride: its mean step from one to the next, else its standard deviation, else 1.
+// Size of an output y (count,), of this stride: its mean step from one to the next, 1 where it never moves.
 inline double window_size(std::size_t count, std::ptrdiff_t stride, const double* y) {
-    double sum = 0.0, square = 0.0;
+    double sum = 0.0;
     for (std::size_t k = 1; k < count; k++) sum += std::fabs(y[stride * k] - y[stride * (k - 1)]);
-    if (sum > 0.0) return sum / (count - 1);
-    for (std::size_t k = 0; k < count; k++) sum += y[stride * k];
-    for (std::size_t k = 0; k < count; k++) square += (y[stride * k] - sum / count) * (y[stride * k] - sum / count);
-    square = count ? std::sqrt(square / count) : 0.0;
-    return square > 0.0 ? square : 1.0;
+    return sum > 0.0 ? sum / (count - 1) : 1.0;
 }
 
 // Sizes of the states, (nx,), by those of the outputs that have counts: what moves them by as much; effect (ny,nx)

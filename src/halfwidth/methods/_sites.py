@@ -9,7 +9,7 @@ half-widths (q, r). Its rows are taken as they are, since nothing can be whitene
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -214,13 +214,14 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
     y = record.y if frame is not None and frame.whole else np.where(record.seen, record.y, 0.0)
     effect = felt(model) if frame is None else frame.felt
     whole = frame is not None and frame.whole
-    scale = _core.window_sizes(effect, list(y.T) if whole else [v[there] for v, there in zip(y.T, record.seen.T)])
+    scale = _core.window_sizes(effect, list(y.T) if whole else [v[there] for v, there in zip(y.T, record.seen.T, strict=True)])
     if frame is None or not frame.fits(scale, y):
-        frame = _frame(model, record, scale, outliers)
-        if frames is not None and kept and _constant(model) and frame.fits(scale, y):
-            if len(frames) >= _FRAMES:
-                del frames[next(iter(frames))]
-            frames[kept] = frame
+        kept_too = frames is not None and kept != b"" and _constant(model)
+        frame = _of_rows(model, record, scale, outliers, frames) if kept_too else None  # type: ignore[arg-type]
+        if frame is None or not frame.fits(scale, y):
+            frame = _frame(model, record, scale, outliers)
+        elif frames is not None:
+            _keep(frames, kept, frame)
     if frame.B is None:
         b = _added(model, record)
     else:
@@ -246,6 +247,59 @@ def _constant(model: Linear) -> bool:
         and all(m.value is not None and m.value.ndim == 2 for m in (*model.matrices.values(), *covs))
         and all(part.known or bool(np.less(*_ends(part, 1)).all()) for part in noises)
     )
+
+
+def _keep(frames: dict[bytes, Frame], key: bytes, frame: Frame) -> None:
+    if len(frames) >= _FRAMES:
+        del frames[next(iter(frames))]
+    frames[key] = frame
+
+
+def _of_rows(model: Linear, record: Record, scale: Array, outliers: bool, frames: dict[bytes, Frame]) -> Frame:
+    """Return the frame of a record from those of its rows: matrices are constant, so a row has what its pattern has."""
+    keys = [seen.tobytes() for seen in record.seen]
+    rows: dict[bytes, Frame] = {}
+    for k, key in enumerate(keys):
+        if key not in rows:
+            found = frames.get(key)
+            if found is None:
+                one = slice(k, k + 1)
+                part = Record.of(record.t[one], record.y[one], None if record.u is None else record.u[one], record.seen[one])
+                found = _frame(model, part, scale, outliers)
+                _keep(frames, key, found)
+            rows[key] = found
+    each = [rows[key] for key in keys]
+    T, ny, first = len(each), model.ny, each[0]
+    sizes = [len(f.row) for f in each]
+    row = np.repeat(np.arange(T), sizes)
+    flat = all(f.Y.ndim == 1 for f in rows.values())
+    problem = dict(first.problem, start=np.concatenate(([0, 0], np.cumsum(sizes)), dtype=np.int32))
+    none = {"mix": np.zeros((0, len(first.cap))), "group_R": np.zeros(0, dtype=np.int32)}
+    for name in ("h", "kind", "group", "R", "lo", "hi", "mix", "group_R"):
+        parts = {key: f.problem[name] for key, f in rows.items()}
+        if all(part is None for part in parts.values()):
+            continue
+        for key, f in rows.items():
+            if parts[key] is None:
+                absent = none[name]
+                parts[key] = np.full((len(f.row), *absent.shape[1:]), 0 if name == "mix" else -1, dtype=absent.dtype)
+        problem[name] = np.concatenate([parts[key] for key in keys])
+    count = np.sum([f.count for f in each], axis=0)
+    wide = {key: f.Y if flat or f.Y.ndim == 2 else _spread_out(f, ny) for key, f in rows.items()}
+    at = np.concatenate([f.at if flat else np.zeros(len(f.row), dtype=np.intp) for f in each])
+    return replace(
+        first, problem=problem, free=(first.uniform | first.fitted) & (first.floor < first.cap) & (count > 0), count=count,
+        row=row, output=np.concatenate([f.output for f in each]), Y=np.concatenate([wide[key] for key in keys]),
+        at=at + row * (ny if flat else 1), whole=all(f.whole for f in rows.values()),
+        gaussian=all(f.gaussian for f in rows.values()), learners={},
+    )  # fmt: skip
+
+
+def _spread_out(frame: Frame, ny: int) -> Array:
+    """Return `Y` of the frame of one row as (K, ny)."""
+    Y = np.zeros((len(frame.Y), ny))
+    Y[np.arange(len(Y)), frame.at] = frame.Y
+    return Y
 
 
 def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame:
