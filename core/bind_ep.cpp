@@ -586,14 +586,14 @@ class EpFrame {
     std::size_t q_ = 0;
 };
 
-nb::tuple known(InBool free, In start, In pull, In precision, In power) {
+nb::tuple taken(InBool free, In start, In pull, In precision, In power) {
     const std::size_t p = free.size();
     want(start.size() == p && pull.size() == p && precision.size() == p * p && power.size() == p,
          "start, pull, power (p,), precision (p,p)");
     double *h = nullptr, *H = nullptr, *g = nullptr;
     nb::object found_h = fresh({p}, &h), found_H = fresh({p, p}, &H), found_g = fresh({p}, &g);
     Work work(5 * p * (p + 1));
-    HW_PICK_WIDE(ep_known_part)(static_cast<int>(p), free.data(), start.data(), pull.data(), precision.data(), power.data(), h, H, g, work.p);
+    HW_PICK_WIDE(ep_taken_part)(static_cast<int>(p), free.data(), start.data(), pull.data(), precision.data(), power.data(), h, H, g, work.p);
     return nb::make_tuple(found_h, found_H, found_g);
 }
 
@@ -602,7 +602,7 @@ nb::tuple known(InBool free, In start, In pull, In precision, In power) {
 void bind_ep(nb::module_& mod) {
     mod.def("ep_run", &run, "problem"_a, "s"_a, "eps"_a, "sweeps"_a, "tol"_a, "damping"_a, "sites"_a.none(),
             "Expectation propagation on a chain for given half-widths, one set a member; see core/ep_entry.hpp.");
-    mod.def("ep_known", &known, "free"_a, "start"_a, "pull"_a, "precision"_a, "power"_a,
+    mod.def("ep_taken", &taken, "free"_a, "start"_a, "pull"_a, "precision"_a, "power"_a,
             "What is known of the free half-widths alone, whatever the others are; see core/ep_handover.hpp.");
     nb::class_<EpHanded>(mod, "EpHanded", "What the next window of a stream may take up; see core/ep_handover.hpp.")
         .def("__init__", &load, "start"_a, "n"_a, "q"_a, "columns"_a, "log_mode"_a, "log_prior"_a, "since"_a, "arrays"_a)

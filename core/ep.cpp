@@ -193,7 +193,7 @@ std::size_t ep_learn_workspace(const EpLearnArgs& a) {
     return a.outside ? own + wide_lanes + ep_workspace(*a.outside) : own;
 }
 
-void ep_known_part(int p, const bool* free, const double* start, const double* pull, const double* precision, const double* power,
+void ep_taken_part(int p, const bool* free, const double* start, const double* pull, const double* precision, const double* power,
                    double* found_pull, double* found_precision, double* found_power, double* work) {
     ep_taken(p, free, start, pull, precision, power, found_pull, found_precision, found_power, work);
 }

@@ -79,7 +79,7 @@ inline bool ep_definite(int n, const double* A, double* L) {
 
 // What is known of the free ones of p half-widths alone, whatever the others are, as a proper Gaussian: found_pull (p,),
 // found_precision (p,p), 0 at the others. work (4 p^2 + 4 p)
-inline void ep_known(int p, const bool* free, const double* pull, const double* precision, double* found_pull,
+inline void ep_marginal(int p, const bool* free, const double* pull, const double* precision, double* found_pull,
                      double* found_precision, double* work) {
     double *A = work, *V = A + p * p, *H = V + p * p, *gain = H + p * p, *h = gain + p * p, *unit = h + p, *turned = unit + p;
     int f = 0, r = 0, at[2] = {0, 0};
@@ -166,7 +166,7 @@ inline void ep_taken(int p, const bool* free, const double* start, const double*
         whole[i] = pull[i] + 2.0 * curve_of(i) * start[i];
         for (int j = 0; j < p; j++) whole_precision[i * p + j] = precision[i * p + j] + (i == j ? curve_of(i) : 0.0);
     }
-    ep_known(p, free, whole, whole_precision, found_pull, found_precision, work + p * (p + 1));
+    ep_marginal(p, free, whole, whole_precision, found_pull, found_precision, work + p * (p + 1));
     for (int i = 0; i < p; i++) {
         found_power[i] = 0.0;
         const double curve = curve_of(i), left = found_precision[i * p + i] - curve;

@@ -120,7 +120,7 @@ def test_no_row_speaks_twice():
 def test_of_marginalises_and_keeps_what_is_proper():
     H = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, -1.0]])
     free = np.array([True, False, True])
-    pull, precision, _ = _core.ep_known(free, np.ones(3), np.array([1.0, 2.0, 3.0]), H, np.zeros(3))
+    pull, precision, _ = _core.ep_taken(free, np.ones(3), np.array([1.0, 2.0, 3.0]), H, np.zeros(3))
     assert precision[0, 0] == pytest.approx(4 - 1 / 2)
     assert pull[0] == pytest.approx(1 - 2 / 2)
     assert precision[2, 2] == pull[2] == 0.0
@@ -139,7 +139,7 @@ def test_what_is_known_of_the_free_ones_equals_the_twin(seed):
     pull, start = rng.standard_normal(p), 10.0 ** rng.uniform(-1, 1, p)
     for power in (np.zeros(p), np.abs(np.diagonal(H)) * start**2 * rng.exponential(1.0, p)):
         args = free, start, pull, H, power
-        for ours, twin in zip(_core.ep_known(*args), naive_carry.taken(*args), strict=True):
+        for ours, twin in zip(_core.ep_taken(*args), naive_carry.taken(*args), strict=True):
             np.testing.assert_allclose(ours, twin, rtol=1e-8, atol=1e-9 * max(np.abs(twin).max(), 1e-9))
 
 
@@ -154,7 +154,7 @@ def test_a_power_and_a_line_are_a_gamma_law():
 
 def test_a_power_beside_a_growing_gaussian_is_no_power():
     grows = np.array([[-60.0]])
-    pull, precision, power = _core.ep_known(np.array([True]), np.ones(1), np.ones(1), grows, np.array([100.0]))
+    pull, precision, power = _core.ep_taken(np.array([True]), np.ones(1), np.ones(1), grows, np.array([100.0]))
     assert power[0] == 0.0
     assert precision[0, 0] == pytest.approx(40.0)
     assert pull[0] == pytest.approx(201.0)

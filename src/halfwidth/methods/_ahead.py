@@ -32,7 +32,7 @@ class Forecasts:
 
     def move(self, model: Model, record: Record, k: int, x: Array) -> Array:
         """Move on to row k; returns what is expected after x, the estimate of the row before."""
-        held = self._x[: self._count + 1]
+        held: Array = self._x[: self._count + 1]
         held[0] = x
         if self._step is None:
             moved = expected(model, record, k, held)
@@ -41,7 +41,7 @@ class Forecasts:
             held[:] = moved
         else:
             _core.window_forecast(held, *self._step, None if record.u is None else record.u[k], *self._box)
-        return held[0]
+        return np.asarray(held[0])
 
     def grow(self, model: Model, record: Record, k: int, x: Array) -> None:
         """No window ends here: what states may stray by adds up; x as in `move`."""
@@ -84,9 +84,10 @@ def _constant_step(model: Model) -> tuple[Array, Array | None] | None:
     """Return E^-1 A and E^-1 B of a model whose matrices are constant and known."""
     if not isinstance(model, Linear) or any(m is not None and not m.constant for m in (model.A, model.B, model.E)):
         return None
-    A, B = model.A.single, None if model.B is None else model.B.single
+    given = [None if m is None else m.single for m in (model.A, model.B)]
     if model.E is not None:
-        A, B = np.linalg.solve(model.E.single, A), None if B is None else np.linalg.solve(model.E.single, B)
-    if np.isnan(A).any() or (B is not None and np.isnan(B).any()):
+        given = [None if m is None else np.asarray(np.linalg.solve(model.E.single, m)) for m in given]
+    A, B = (None if m is None else np.ascontiguousarray(m, dtype=float) for m in given)
+    if A is None or np.isnan(A).any() or (B is not None and np.isnan(B).any()):
         return None
-    return np.ascontiguousarray(A), None if B is None else np.ascontiguousarray(B)
+    return A, B

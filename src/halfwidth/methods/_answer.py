@@ -47,12 +47,13 @@ class Answer:
         self.sound = code < 2 and found["finite"]
         bounds = model.bounds
         self.within = (bounds.lo, bounds.hi) if isinstance(bounds, Box) else None
-        self.x, self.P = (found["x"], found["P"]) if self.sound else self._fallback()
+        moments: tuple[Array, Array] = (found["x"], found["P"]) if self.sound else self._fallback()
+        self.x, self.P = moments
         if self.within is not None:
             inside = self.x[1:]
             np.minimum(np.maximum(inside, self.within[0], out=inside), self.within[1], out=inside)
         # mean, sd, and ends of 90 % of the half-widths, and of the variances that are unknown, each (p,)
-        self.widths = found["widths"].copy() if self.sound else self._no_widths()
+        self.widths: Array = found["widths"].copy() if self.sound else self._no_widths()
         self.status = self._status()
 
     def amended(self, estimate: Estimate) -> "Answer":

@@ -65,7 +65,7 @@ class Rows:
             self.put(self.times, self.y, self.u, self.seen, self.x, self.low, self.high)
         k = self._to
         times, all_y, all_u, seen = self._held[:4]
-        there = [v == v for v in y.tolist()]
+        there: list[bool] = [v == v for v in y.tolist()]
         times[k], all_y[k], seen[k] = t, y, there
         if u is not None:
             all_u[k] = u

@@ -214,14 +214,16 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
     y = record.y if frame is not None and frame.whole else np.where(record.seen, record.y, 0.0)
     effect = felt(model) if frame is None else frame.felt
     whole = frame is not None and frame.whole
-    scale = _core.window_sizes(effect, list(y.T) if whole else [v[there] for v, there in zip(y.T, record.seen.T, strict=True)])
+    scale = _core.window_sizes(
+        effect, list(y.T) if whole else [v[there] for v, there in zip(y.T, record.seen.T, strict=True)]
+    )
     if frame is None or not frame.fits(scale, y):
-        kept_too = frames is not None and kept != b"" and _constant(model)
-        frame = _of_rows(model, record, scale, outliers, frames) if kept_too else None  # type: ignore[arg-type]
-        if frame is None or not frame.fits(scale, y):
-            frame = _frame(model, record, scale, outliers)
-        elif frames is not None:
-            _keep(frames, kept, frame)
+        made = None
+        if frames is not None and kept and _constant(model):
+            made = _of_rows(model, record, scale, outliers, frames)
+        if made is not None and frames is not None and made.fits(scale, y):
+            _keep(frames, kept, made)
+        frame = _frame(model, record, scale, outliers) if made is None else made
     if frame.B is None:
         b = _added(model, record)
     else:
@@ -255,17 +257,24 @@ def _keep(frames: dict[bytes, Frame], key: bytes, frame: Frame) -> None:
     frames[key] = frame
 
 
-def _of_rows(model: Linear, record: Record, scale: Array, outliers: bool, frames: dict[bytes, Frame]) -> Frame:
-    """Return the frame of a record from those of its rows: matrices are constant, so a row has what its pattern has."""
-    keys = [seen.tobytes() for seen in record.seen]
+def _of_rows(model: Linear, record: Record, scale: Array, outliers: bool, frames: dict[bytes, Frame]) -> Frame | None:
+    """Return the frame of a record from those of its rows, None where outputs lift a variance.
+
+    Matrices are constant, so rows of one pattern differ in their data only.
+    """
+    y, keys = np.where(record.seen, record.y, 0.0), [seen.tobytes() for seen in record.seen]
     rows: dict[bytes, Frame] = {}
     for k, key in enumerate(keys):
         if key not in rows:
             found = frames.get(key)
             if found is None:
                 one = slice(k, k + 1)
-                part = Record.of(record.t[one], record.y[one], None if record.u is None else record.u[one], record.seen[one])
+                part = Record.of(
+                    record.t[one], record.y[one], None if record.u is None else record.u[one], record.seen[one]
+                )
                 found = _frame(model, part, scale, outliers)
+                if not found.fits(scale, y):
+                    return None
                 _keep(frames, key, found)
             rows[key] = found
     each = [rows[key] for key in keys]
@@ -274,15 +283,14 @@ def _of_rows(model: Linear, record: Record, scale: Array, outliers: bool, frames
     row = np.repeat(np.arange(T), sizes)
     flat = all(f.Y.ndim == 1 for f in rows.values())
     problem = dict(first.problem, start=np.concatenate(([0, 0], np.cumsum(sizes)), dtype=np.int32))
-    none = {"mix": np.zeros((0, len(first.cap))), "group_R": np.zeros(0, dtype=np.int32)}
+    none: dict[str, Any] = {"mix": np.zeros(len(first.cap)), "group_R": np.int32(-1)}
     for name in ("h", "kind", "group", "R", "lo", "hi", "mix", "group_R"):
         parts = {key: f.problem[name] for key, f in rows.items()}
         if all(part is None for part in parts.values()):
             continue
         for key, f in rows.items():
             if parts[key] is None:
-                absent = none[name]
-                parts[key] = np.full((len(f.row), *absent.shape[1:]), 0 if name == "mix" else -1, dtype=absent.dtype)
+                parts[key] = np.repeat(none[name][None], len(f.row), axis=0)
         problem[name] = np.concatenate([parts[key] for key in keys])
     count = np.sum([f.count for f in each], axis=0)
     wide = {key: f.Y if flat or f.Y.ndim == 2 else _spread_out(f, ny) for key, f in rows.items()}
