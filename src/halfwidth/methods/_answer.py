@@ -8,7 +8,8 @@ import numpy as np
 import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.methods._carry import Known, Start
-from halfwidth.methods._sites import Sites, uniform_part
+from halfwidth.methods._noise_parts import uniform_part
+from halfwidth.methods._sites import Sites
 from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from halfwidth.array import Array
+from halfwidth.methods._noise_parts import gaussian_part, uniform_part
 from halfwidth.methods._residuals import first_scales
-from halfwidth.methods._sites import gaussian_part, uniform_part
 from halfwidth.model import Linear, Nonlinear, arity
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record

@@ -1,11 +1,8 @@
 """A linear model over one record as a chain with factors on linear functionals: what `halfwidth._core.ep_*` take.
 
 ``x[t] = E^-1 (A x[t-1] + B u[t] + w[t])`` carries one factor on each w that has a uniform part; the rows of a stage are
-its seen outputs, ``h'x - y = e``, and the bounds. An unseen output that a seen one is correlated with through F is
-eliminated, and its half-width counts as variance of that row (as in `_residuals`).
-
-A Gaussian part of unknown variances has independent entries: its standard deviations are groups of their own, after the
-half-widths (q, r). Its rows are taken as they are, since nothing can be whitened that is not known.
+its seen outputs, ``h'x - y = e``, and the bounds (`_factors`). What no data are in is a `Frame`, which windows with the
+same outputs seen have in common.
 """
 
 import math
@@ -19,18 +16,16 @@ from numpy.typing import NDArray
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.methods._residuals import _eliminate, felt, reference, residuals
-from halfwidth.model import Linear, Model
-from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
+from halfwidth.methods._factors import EXACT, GAUSSIAN, MAYBE_LOST, TRUNCATION, bounds, every, first_bounds, outputs
+from halfwidth.methods._noise_parts import all_groups, ends_of, gaussian_part, given, uniform_part
+from halfwidth.methods._residuals import felt, reference, residuals
+from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.spread import Box, Normal
-from halfwidth.varying import Varying, varying
+from halfwidth.varying import Varying
 
-GAUSSIAN, UNIFORM, UNIFORM_GAUSSIAN, CONTAMINATED, MAYBE_LOST, TRUNCATION = range(6)
 #: Standard deviation of an outlier in half-widths.
 WIDE = 10.0
-#: Variances below this share of the output's own scale, squared, count as no noise: information must stay finite.
-_EXACT = 1e-12
 #: ... and so a standard deviation that is to be found stays above this share of it.
 _LEAST = 1e-6
 
@@ -95,8 +90,8 @@ class Frame:
         """Say whether no variance is so small beside the outputs y (T, ny), of scale (p,), that it is lifted."""
         if self.R is None:
             return True
-        size = np.maximum(scale[-len(self.R) :], math.sqrt(_EXACT) * np.abs(y).max())
-        return bool((2.0 * _EXACT * size**2 < self.R).all())
+        size = np.maximum(scale[-len(self.R) :], math.sqrt(EXACT) * np.abs(y).max())
+        return bool((2.0 * EXACT * size**2 < self.R).all())
 
     def targets(self, y: Array) -> Array:
         """Return the targets (K,) of the rows of the chain; y (T, ny) is 0 where unseen."""
@@ -235,6 +230,11 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
     return Sites(frame, floor, scale, *_first_state(model, record), b, frame.targets(y))
 
 
+def _seen(record: Record) -> list[Array]:
+    """Return the seen values of each output."""
+    return [v[there] for v, there in zip(record.y.T, record.seen.T, strict=True)]
+
+
 def _half_open(x0: Any) -> bool:
     """Say whether a box has an end without the other: a bound of the first state, which is in the frame."""
     return isinstance(x0, Box) and bool((np.isfinite(x0.lo) ^ np.isfinite(x0.hi)).any())
@@ -247,7 +247,7 @@ def _constant(model: Linear) -> bool:
     return (
         model.loss is None
         and all(m.value is not None and m.value.ndim == 2 for m in (*model.matrices.values(), *covs))
-        and all(part.known or bool(np.less(*_ends(part, 1)).all()) for part in noises)
+        and all(part.known or bool(np.less(*ends_of(part, 1)).all()) for part in noises)
     )
 
 
@@ -295,8 +295,9 @@ def _of_rows(model: Linear, record: Record, scale: Array, outliers: bool, frames
     count = np.sum([f.count for f in each], axis=0)
     wide = {key: f.Y if flat or f.Y.ndim == 2 else _spread_out(f, ny) for key, f in rows.items()}
     at = np.concatenate([f.at if flat else np.zeros(len(f.row), dtype=np.intp) for f in each])
+    free = (first.uniform | first.fitted) & (first.floor < first.cap) & (count > 0)
     return replace(
-        first, problem=problem, free=(first.uniform | first.fitted) & (first.floor < first.cap) & (count > 0), count=count,
+        first, problem=problem, free=free, count=count,
         row=row, output=np.concatenate([f.output for f in each]), Y=np.concatenate([wide[key] for key in keys]),
         at=at + row * (ny if flat else 1), whole=all(f.whole for f in rows.values()),
         gaussian=all(f.gaussian for f in rows.values()), learners={},
@@ -313,7 +314,7 @@ def _spread_out(frame: Frame, ny: int) -> Array:
 def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame:
     T, nx, ny = len(record), model.nx, model.ny
     dt = record.steps(model.dt)
-    floor, cap, uniform, fitted = _groups(model)
+    floor, cap, uniform, fitted = all_groups(model)
     p = len(floor)
     problem: dict[str, Any] = {"groups": p, "wide": WIDE}
     _dynamics(problem, model, record, dt)
@@ -321,9 +322,9 @@ def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame
     problem["group_w"] = w_group.astype(np.int32)
     of_w = (fitted & (floor < cap))[nx + ny :][:nx]
     problem["group_Q"] = np.where(of_w, nx + ny + np.arange(nx), -1).astype(np.int32) if of_w.any() else None
-    rows = _outputs(model, record, dt, scale, outliers)
-    rows += _bounds(model, T)
-    rows += _first_bounds(model)
+    rows = outputs(model, record, dt, scale, outliers)
+    rows += bounds(model, T)
+    rows += first_bounds(model)
     stage = np.concatenate([r.stage for r in rows]) if rows else np.zeros(0, dtype=np.intp)
     order = np.argsort(stage, kind="stable")
     problem["start"] = np.searchsorted(stage[order], np.arange(T + 2)).astype(np.int32)
@@ -362,82 +363,6 @@ def _frame(model: Linear, record: Record, scale: Array, outliers: bool) -> Frame
     )  # fmt: skip
 
 
-def groups(model: Model) -> int:
-    """Return the number of groups that the chain of a model has."""
-    once = model.nx + model.ny
-    return once if all(part is None or part.known for part in map(gaussian_part, (model.w, model.e))) else 2 * once
-
-
-def unknowns(model: Model) -> int:
-    """Return how many half-widths and variances of a model are to be found."""
-    count = 0
-    for noise, n in ((model.w, model.nx), (model.e, model.ny)):
-        box, part = uniform_part(noise), gaussian_part(noise)
-        ends = [] if box is None else [np.array([np.broadcast_to(v, n) for v in (box.at_least, box.at_most)])]
-        for lo, hi in [*ends, _ends(part, n)]:
-            count += int(np.count_nonzero(lo < hi))
-    return count
-
-
-def _groups(model: Linear) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return floors and caps of all groups, which are half-widths and which unknown deviations; each (p,)."""
-    floor, cap, uniform = _half_widths(model)
-    if groups(model) == len(floor):
-        return floor, cap, uniform, np.zeros(len(floor), dtype=bool)
-    of = [(gaussian_part(noise), n) for noise, n in ((model.w, model.nx), (model.e, model.ny))]
-    lo, hi = np.sqrt(np.concatenate([_ends(part, n) for part, n in of], axis=1))
-    asked = np.concatenate([np.full(n, part is not None and not part.known) for part, n in of])
-    no = np.zeros(len(floor), dtype=bool)
-    return np.r_[floor, lo], np.r_[cap, hi], np.r_[uniform, no], np.r_[no, asked]
-
-
-def _ends(part: Gaussian | None, n: int) -> Array:
-    """Return the variances between which unknown ones lie, (2, n); 0 for a noise that has none."""
-    if part is None or part.at_least is None or part.at_most is None:
-        return np.zeros((2, n))
-    return np.array([part.at_least, part.at_most])
-
-
-def _half_widths(model: Linear) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return floors and caps of the half-widths (q, r), 0 where a noise has none, and which have one, (nx + ny,)."""
-    parts: list[tuple[Array, Array, NDArray[np.bool_]]] = []
-    for noise, n in ((model.w, model.nx), (model.e, model.ny)):
-        box = uniform_part(noise)
-        if box is None:
-            parts.append((np.zeros(n), np.zeros(n), np.zeros(n, dtype=bool)))
-        else:
-            parts.append((np.atleast_1d(box.at_least), np.atleast_1d(box.at_most), np.ones(n, dtype=bool)))
-    return (
-        np.concatenate([f[0] for f in parts]),
-        np.concatenate([f[1] for f in parts]),
-        np.concatenate([f[2] for f in parts]),
-    )
-
-
-def uniform_part(noise: Noise) -> Uniform | None:
-    """Return the bounded part of a noise, if it has one."""
-    return noise if isinstance(noise, Uniform) else noise.uniform if isinstance(noise, Mixed) else None
-
-
-def gaussian_part(noise: Noise) -> Gaussian | None:
-    """Return the Gaussian part of a noise, if it has one."""
-    return noise if isinstance(noise, Gaussian) else noise.gaussian if isinstance(noise, Mixed) else None
-
-
-def given(part: Gaussian, n: int) -> Varying | None:
-    """Return the covariance of a Gaussian part without entries whose variance is to be found, None if none is left."""
-    if part.known:
-        return part.cov()
-    lo, hi = _ends(part, n)
-    kept = np.where(lo < hi, 0.0, lo)
-    return varying(np.diag(kept), "Q", (n, n)) if kept.any() else None
-
-
-def _every(matrix: Varying, record: Record, dt: Array) -> Array:
-    stack, index = matrix.stack(record.t, dt)
-    return np.broadcast_to(stack, (len(record), *stack.shape[1:])) if index is None else stack[index]
-
-
 def _one(matrix: Varying | None, record: Record, dt: Array) -> tuple[Array, NDArray[np.int32] | None]:
     """Return the distinct matrices and the index of each row, None where one serves all or each has its own."""
     assert matrix is not None
@@ -458,10 +383,10 @@ def _dynamics(problem: dict[str, Any], model: Linear, record: Record, dt: Array)
             if Q is not None:
                 problem["Q"] = G @ problem["Q"] @ G[0].T
         else:
-            G = np.linalg.inv(_every(model.E, record, dt))
-            A, A_index = G @ _every(model.A, record, dt), None
+            G = np.linalg.inv(every(model.E, record, dt))
+            A, A_index = G @ every(model.A, record, dt), None
             if Q is not None:
-                problem["Q"], problem["Q_index"] = G @ _every(Q, record, dt) @ np.swapaxes(G, 1, 2), None
+                problem["Q"], problem["Q_index"] = G @ every(Q, record, dt) @ np.swapaxes(G, 1, 2), None
         problem["G"] = np.ascontiguousarray(G, dtype=float)
     if problem["Q"] is not None:
         problem["Q"] = np.ascontiguousarray(problem["Q"], dtype=float)
@@ -473,9 +398,9 @@ def _added(model: Linear, record: Record) -> Array:
     b: Array = np.zeros((len(record), model.nx))
     dt = record.steps(model.dt)
     if model.B is not None and record.u is not None:
-        b = np.einsum("tij,tj->ti", _every(model.B, record, dt), record.u)
+        b = np.einsum("tij,tj->ti", every(model.B, record, dt), record.u)
     if model.E is not None:
-        b = np.asarray(np.linalg.solve(_every(model.E, record, dt), b[:, :, None])[:, :, 0])
+        b = np.asarray(np.linalg.solve(every(model.E, record, dt), b[:, :, None])[:, :, 0])
     return np.ascontiguousarray(b)
 
 
@@ -497,165 +422,3 @@ def _first_state(model: Linear, record: Record) -> tuple[Array, Array, Array]:
         m0 = np.where(finite, m0, base.X[:nx])
         P0 = np.diag(np.where(finite, 0.0, wide**2))
     return np.ascontiguousarray(m0, dtype=float), P0, half
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Rows of one kind; see core/ep_entry.hpp."""
-
-    stage: NDArray[np.intp]
-    h: Array
-    Y: Array  # (K, ny): seen outputs of the row to the target
-    kind: NDArray[np.int8]
-    group: NDArray[np.int32]
-    R: Array
-    lo: Array
-    hi: Array
-    lost: Array
-    mix: Array
-    output: NDArray[np.intp]
-    deviation: NDArray[np.int32]
-
-    @classmethod
-    def of(cls, model: Linear, stage: NDArray[np.intp], h: Array, kind: Any, **more: Any) -> "_Rows":
-        """Fill in what a kind of row does not have."""
-        K, p = len(stage), groups(model)
-        none = {
-            "Y": np.zeros((K, model.ny)),
-            "group": np.full(K, -1),
-            "R": np.zeros(K),
-            "lo": np.zeros(K),
-            "hi": np.zeros(K),
-        }
-        none |= {"lost": np.zeros(K), "mix": np.zeros((K, p)), "output": np.full(K, -1), "deviation": np.full(K, -1)}
-        return cls(stage=stage, h=h, kind=np.broadcast_to(np.asarray(kind, dtype=np.int8), (K,)), **(none | more))
-
-
-def _outputs(model: Linear, record: Record, dt: Array, scale: Array, outliers: bool) -> list[_Rows]:
-    T, nx, ny = len(record), model.nx, model.ny
-    p, once = groups(model), nx + ny
-    box, part = uniform_part(model.e), gaussian_part(model.e)
-    if box is None and part is not None and part.known:
-        return _gaussian_outputs(model, record, dt, scale)
-    C, seen = _every(model.C, record, dt), record.seen
-    t, j = np.nonzero(seen)
-    Y = np.eye(ny)[j]
-    R = np.zeros((T, ny))
-    own = None if part is None else given(part, ny)
-    if own is not None:
-        R = np.diagonal(_every(own, record, dt), axis1=1, axis2=2)
-    lo, hi = _ends(part, ny)
-    deviation = np.where(lo < hi, once + nx + np.arange(ny), -1)[j]
-    mix = np.zeros((len(t), p))
-    if model.F is not None:
-        F = _every(model.F, record, dt)
-        N = _eliminate(F, seen)
-        C, Y = N @ C, (N @ F)[t, j]
-        R = np.einsum("tij,tj->ti", N**2, R)
-        others = np.where(np.eye(ny)[j] > 0, 0.0, N[t, j] ** 2)
-        if box is not None:
-            mix[:, nx:once] = others / 3.0
-        if p > once:
-            mix[:, once + nx :] = np.where(lo < hi, others, 0.0)
-    more: dict[str, Any] = {"lost": np.zeros(len(t))}
-    if model.loss is not None:
-        kind: Any = np.full(len(t), MAYBE_LOST)
-        more["lost"] = _lost(model, record, dt, t, j)
-    elif outliers:
-        kind = np.full(len(t), CONTAMINATED)
-    elif box is None:
-        kind = np.full(len(t), GAUSSIAN)
-        floor = _EXACT * scale[nx + j] ** 2  # of a known variance beside unknown ones
-        R = R.copy()
-        R[t, j] = np.where(deviation < 0, np.maximum(R[t, j], floor), R[t, j])
-    else:
-        kind = np.where((R[t, j] > 0) | (deviation >= 0) | mix.any(axis=1), UNIFORM_GAUSSIAN, UNIFORM)
-    more |= {"R": np.array(R[t, j]), "group": nx + j if box is not None else np.full(len(t), -1)}
-    return [_Rows.of(model, t + 1, C[t, j], kind, Y=Y, mix=mix, output=j, deviation=deviation, **more)]
-
-
-def _gaussian_outputs(model: Linear, record: Record, dt: Array, scale: Array) -> list[_Rows]:
-    """Whiten the seen outputs of each row."""
-    nx, ny = model.nx, model.ny
-    part = gaussian_part(model.e)
-    assert part is not None
-    C, R = _every(model.C, record, dt), _every(part.cov(), record, dt)
-    y = np.where(record.seen, record.y, 0.0)
-    if model.F is not None:
-        inverse = np.linalg.inv(_every(model.F, record, dt))
-        C = inverse @ C
-        R = inverse @ R @ np.swapaxes(inverse, 1, 2)
-    found = []
-    patterns, which = np.unique(record.seen, axis=0, return_inverse=True)
-    for k, pattern in enumerate(patterns):
-        s = np.flatnonzero(pattern)
-        if not s.size:
-            continue
-        t = np.flatnonzero(which.ravel() == k)
-        part_R = np.array(R[t][:, s][:, :, s])
-        least = _EXACT * np.maximum(scale[nx + s] ** 2, np.abs(y[t][:, s]).max(axis=0) ** 2 * _EXACT)
-        part_R[:, np.arange(s.size), np.arange(s.size)] += np.where(
-            np.diagonal(part_R, axis1=1, axis2=2) <= least, least, 0.0
-        )
-        if model.loss is not None:  # a loss strikes one sensor: `refused` has seen to a diagonal R
-            for a, j in enumerate(s):
-                more = {"Y": np.tile(np.eye(ny)[j], (t.size, 1)), "R": part_R[:, a, a], "output": np.full(t.size, j)}
-                more["lost"] = _lost(model, record, dt, t, np.full(t.size, j))
-                found.append(_Rows.of(model, t + 1, C[t, j], MAYBE_LOST, **more))
-            continue
-        try:
-            L = np.linalg.cholesky(part_R)
-        except np.linalg.LinAlgError:
-            spread = np.einsum("tii->t", part_R)[:, None, None] * 1e-12
-            L = np.linalg.cholesky(part_R + spread * np.eye(s.size))
-        h = np.linalg.solve(L, C[t][:, s])
-        white = np.zeros((t.size, s.size, ny))
-        white[:, :, s] = np.linalg.inv(L)
-        # the whitened row keeps the unit of its output, so that its density is the output's own
-        d = np.diagonal(L, axis1=1, axis2=2)
-        for a, j in enumerate(s):
-            found.append(
-                _Rows.of(
-                    model, t + 1, h[:, a] * d[:, a, None], GAUSSIAN, Y=white[:, a] * d[:, a, None], R=d[:, a] ** 2,
-                    output=np.full(t.size, j),
-                )
-            )  # fmt: skip
-    return found
-
-
-def _lost(model: Linear, record: Record, dt: Array, t: NDArray[np.intp], j: NDArray[np.intp]) -> Array:
-    """Return the log density of each seen output if it was lost."""
-    # unknown noise says nothing here: the noise of lost samples is given then
-    R = _every(model.e.cov(), record, dt) if model.e.known else np.zeros((len(record), model.ny, model.ny))
-    kind = model.loss.kind[0]
-    found = np.zeros(len(t))
-    center = np.broadcast_to(np.asarray(model.loss.center, dtype=float), (model.ny,))
-    for k, (a, b) in enumerate(zip(t.tolist(), j.tolist(), strict=True)):
-        v = float(model.loss.cov(kind, R[a])[b, b])
-        found[k] = -0.5 * (np.log(2 * np.pi * v) + (record.y[a, b] - center[b]) ** 2 / v)
-    return found
-
-
-def _bounds(model: Linear, T: int) -> list[_Rows]:
-    if model.bounds is None:
-        return []
-    D, lo, hi = model.bounds.rows
-    keep = np.isfinite(lo) | np.isfinite(hi)
-    D, lo, hi = D[keep], lo[keep], hi[keep]
-    if not keep.any():
-        return []
-    K = len(D)
-    stage, h = np.repeat(np.arange(1, T + 1), K), np.broadcast_to(D, (T, K, model.nx)).reshape(-1, model.nx)
-    return [_Rows.of(model, stage, h, TRUNCATION, lo=np.tile(lo, T), hi=np.tile(hi, T))]
-
-
-def _first_bounds(model: Linear) -> list[_Rows]:
-    """One end of the box of x0 without the other is a bound of stage 0."""
-    if not isinstance(model.x0, Box):
-        return []
-    nx = model.nx
-    one = np.flatnonzero(np.isfinite(model.x0.lo) ^ np.isfinite(model.x0.hi))
-    if not one.size:
-        return []
-    stage = np.zeros(one.size, dtype=np.intp)
-    return [_Rows.of(model, stage, np.eye(nx)[one], TRUNCATION, lo=model.x0.lo[one], hi=model.x0.hi[one])]

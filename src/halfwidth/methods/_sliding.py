@@ -24,10 +24,10 @@ from numpy.typing import ArrayLike
 from halfwidth.array import Array
 from halfwidth.methods._ahead import Forecasts
 from halfwidth.methods._carry import Carried
+from halfwidth.methods._noise_parts import groups
 from halfwidth.methods._protocol import Estimator, pushed_row, typed
 from halfwidth.methods._residuals import reference, residuals
 from halfwidth.methods._rows import Rows
-from halfwidth.methods._sites import groups
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.posterior import Posterior
 from halfwidth.methods.sequential import (

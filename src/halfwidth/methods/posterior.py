@@ -40,8 +40,9 @@ from halfwidth.errors import BadShape, BadValue
 from halfwidth.loss import Bernoulli
 from halfwidth.methods._answer import Answer
 from halfwidth.methods._carry import Carried, Known, Start, condition
+from halfwidth.methods._noise_parts import gaussian_part, uniform_part, unknowns
 from halfwidth.methods._protocol import typed
-from halfwidth.methods._sites import Frame, Sites, frames_of, gaussian_part, sites, uniform_part, unknowns
+from halfwidth.methods._sites import Frame, Sites, frames_of, sites
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
