@@ -98,7 +98,7 @@ def test_where_it_does_not_settle_the_path_is_the_chains_and_says_so(monkeypatch
 
     def stalled(self, model, record, *, start=None):
         found = usual(self, model, record, start=start)
-        return found._replace(estimate=dataclasses.replace(found.estimate, status=Status.STALLED))
+        return found.amended(dataclasses.replace(found.estimate, status=Status.STALLED))
 
     monkeypatch.setattr(Posterior, "answer", stalled)
     path = credible.solve([drive], QUICK)[0]
