@@ -265,8 +265,8 @@ class EpHanded : public EpArrays {
     }
     std::vector<std::int32_t> start;
     std::size_t n, q, columns;
-    double *m = nullptr, *D = nullptr, *tau = nullptr, *nu = nullptr, *lanes = nullptr, *lane_phi = nullptr, *mode = nullptr, *H = nullptr;
-    double *edge_x = nullptr, *edge_P = nullptr;
+    double *m = nullptr, *D = nullptr, *tau = nullptr, *nu = nullptr, *lanes = nullptr, *lane_phi = nullptr;
+    double *mode = nullptr, *H = nullptr, *edge_x = nullptr, *edge_P = nullptr;
     double log_mode = 0.0, log_prior = 0.0;
     int since = 0;
 
@@ -299,7 +299,8 @@ void load(EpHanded* into, const std::vector<std::int32_t>& start, std::size_t n,
     EpHanded* h = new (into) EpHanded(start.data(), start.size() - 1, n, q, columns);
     double* to[] = {h->m, h->D, h->tau, h->nu, h->lanes, h->lane_phi, h->mode, h->H, h->edge_x, h->edge_P};
     const std::size_t stages = h->stages(), rows = start.back();
-    const std::size_t sizes[] = {stages * n, stages * n, rows, rows, 2 * (stages * n + rows) * columns, columns * q, q, q * q, stages * n, stages * n * n};
+    const std::size_t noise = stages * n;
+    const std::size_t sizes[] = {noise, noise, rows, rows, 2 * (noise + rows) * columns, columns * q, q, q * q, noise, noise * n};
     bool fits = true;
     for (std::size_t k = 0; k < arrays.size(); k++) {
         fits = fits && arrays[k].size() == sizes[k];
@@ -314,8 +315,8 @@ void load(EpHanded* into, const std::vector<std::int32_t>& start, std::size_t n,
     h->since = since;
 }
 
-// What a window found: x, P, k3, k4 of the states; out (rows,); of half-widths `s`: at the mode, `widths`: mean, sd, lo, hi, and `told`: pull, precision
-// and power, one after the other; of nodes phi, log_weight, slope, second; mode and H; numbers.
+// What a window found: x, P, k3, k4 of the states; out (rows,); of half-widths `s`: at the mode, `widths`: mean, sd, lo, hi,
+// and `told`: pull, precision and power, one after the other; of nodes phi, log_weight, slope, second; mode and H; numbers.
 class EpFound : public EpArrays {
   public:
     int code = 0, nodes = 0, since = 0;
@@ -593,7 +594,8 @@ nb::tuple taken(InBool free, In start, In pull, In precision, In power) {
     double *h = nullptr, *H = nullptr, *g = nullptr;
     nb::object found_h = fresh({p}, &h), found_H = fresh({p, p}, &H), found_g = fresh({p}, &g);
     Work work(5 * p * (p + 1));
-    HW_PICK_WIDE(ep_taken_part)(static_cast<int>(p), free.data(), start.data(), pull.data(), precision.data(), power.data(), h, H, g, work.p);
+    HW_PICK_WIDE(ep_taken_part)(static_cast<int>(p), free.data(), start.data(), pull.data(), precision.data(), power.data(), h, H, g,
+                                work.p);
     return nb::make_tuple(found_h, found_H, found_g);
 }
 

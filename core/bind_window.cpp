@@ -23,14 +23,15 @@ void want(bool ok, const char* what) {
     if (!ok) throw std::invalid_argument(what);
 }
 
-void forecast(InOut x, In A, const std::optional<In>& B, const std::optional<In>& u, const std::optional<In>& lo, const std::optional<In>& hi) {
+void forecast(InOut x, In A, const std::optional<In>& B, const std::optional<In>& u, const std::optional<In>& lo,
+              const std::optional<In>& hi) {
     const std::size_t n = x.shape(1), nu = B && u ? u->size() : 0;
     want(A.size() == n * n && (nu == 0 || B->size() == n * nu) && lo.has_value() == hi.has_value() &&
              (!lo || (lo->size() == n && hi->size() == n)),
          "x (rows,n), A (n,n), B (n,nu), u (nu,), lo, hi (n,)");
     std::vector<double> work(2 * n);
-    hw::window_forecast(x.shape(0), n, nu, x.data(), A.data(), nu ? B->data() : nullptr, nu ? u->data() : nullptr, lo ? lo->data() : nullptr,
-                        hi ? hi->data() : nullptr, work.data());
+    hw::window_forecast(x.shape(0), n, nu, x.data(), A.data(), nu ? B->data() : nullptr, nu ? u->data() : nullptr,
+                        lo ? lo->data() : nullptr, hi ? hi->data() : nullptr, work.data());
 }
 
 nb::object ends(InOut x, In grown) {

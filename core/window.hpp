@@ -68,7 +68,8 @@ inline double window_size(std::size_t count, std::ptrdiff_t stride, const double
 }
 
 // Sizes of the states, (nx,), by those of the outputs that have counts: what moves them by as much; effect (ny,nx)
-inline void window_sizes(std::size_t nx, std::size_t ny, const double* effect, const std::size_t* counts, const double* outputs, double* states) {
+inline void window_sizes(std::size_t nx, std::size_t ny, const double* effect, const std::size_t* counts, const double* outputs,
+                         double* states) {
     for (std::size_t i = 0; i < nx; i++) {
         double gram = 0.0;
         for (std::size_t j = 0; j < ny; j++)
