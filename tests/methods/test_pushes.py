@@ -108,7 +108,7 @@ def test_a_push_is_the_window_on_its_own(name):
         for ours, theirs in zip(newest.interval(0.8), whole.interval(0.8), strict=True):
             np.testing.assert_allclose(ours[0], theirs[-1 - back], **near)
         for ours, theirs in ((newest.q, whole.q), (newest.r, whole.r), (newest.Q, whole.Q), (newest.R, whole.R)):
-            assert (ours is None) == (theirs is None)
+            assert (ours is None) == (theirs is None or not whole.status.good)
             if ours is not None:
                 np.testing.assert_allclose(ours, theirs, **near)
         for kind in ("half_widths", "variances"):
