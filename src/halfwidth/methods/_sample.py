@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 import halfwidth._core as _core
 from halfwidth.array import Array, generator
 from halfwidth.errors import BadValue
+from halfwidth.methods._linearised import filled
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._residuals import Residuals, reference, residuals
 from halfwidth.methods.map import BatchLP
-from halfwidth.methods.sequential import SequentialLP, filled
+from halfwidth.methods.sequential import SequentialLP
 from halfwidth.model import Linear, Model, needs_a_box
 from halfwidth.noise import Gaussian, Noise, Uniform, unknown_variances
 from halfwidth.record import Record

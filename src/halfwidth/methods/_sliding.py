@@ -23,13 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from halfwidth.array import Array
 from halfwidth.methods._carry import Carried
-from halfwidth.methods._protocol import Estimator, pushed_row, typed
-from halfwidth.methods._residuals import reference, residuals
-from halfwidth.methods._sites import groups
-from halfwidth.methods.map import BatchLP
-from halfwidth.methods.posterior import Posterior
-from halfwidth.methods.sequential import (
-    SequentialLP,
+from halfwidth.methods._linearised import (
     expected,
     filled,
     growth,
@@ -38,6 +32,12 @@ from halfwidth.methods.sequential import (
     scaled_costs,
     start_theta,
 )
+from halfwidth.methods._protocol import Estimator, pushed_row, typed
+from halfwidth.methods._residuals import reference, residuals
+from halfwidth.methods._sites import groups
+from halfwidth.methods.map import BatchLP
+from halfwidth.methods.posterior import Posterior
+from halfwidth.methods.sequential import SequentialLP
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status

@@ -12,9 +12,9 @@ import numpy as np
 
 from halfwidth.array import Array, generator
 from halfwidth.errors import BadValue
+from halfwidth.methods._linearised import filled
 from halfwidth.methods._protocol import Estimator
 from halfwidth.methods._sites import gaussian_part, uniform_part
-from halfwidth.methods.sequential import filled
 from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status

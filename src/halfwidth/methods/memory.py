@@ -24,12 +24,12 @@ import numpy as np
 import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadValue
+from halfwidth.methods._linearised import expected, filled
 from halfwidth.methods._protocol import Estimator
 from halfwidth.methods._sites import Sites, sites
 from halfwidth.methods._sliding import Sliding, Solved
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.posterior import Answer, Posterior
-from halfwidth.methods.sequential import expected, filled
 from halfwidth.methods.window import Window
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record

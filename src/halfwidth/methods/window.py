@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadValue, Refused
+from halfwidth.methods._linearised import expected, half_width_bounds
 from halfwidth.methods._protocol import Estimator, typed
 from halfwidth.methods._sliding import (
     TOL,
@@ -51,7 +52,6 @@ from halfwidth.methods._sliding import (
     window_starts,
 )
 from halfwidth.methods.map import BatchLP
-from halfwidth.methods.sequential import expected, half_width_bounds
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
