@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from halfwidth.array import Array
-from halfwidth.methods._residuals import reference, residuals
+from halfwidth.methods._residuals import half_width_bounds, reference, residuals
 from halfwidth.model import Entry, Linear, Model, Nonlinear, arity
-from halfwidth.noise import Gaussian, Uniform
+from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.solvers.banded import Chain, chain_of, solve
 from halfwidth.spread import Box, Normal
@@ -416,16 +416,6 @@ def start_theta(rows: Rows, given: tuple[float, ...] | None) -> Array:
     if given is not None:
         theta[: len(given)] = given
     return np.clip(theta, rows.lo, rows.hi)
-
-
-def half_width_bounds(model: Model) -> tuple[Array, Array]:
-    """Return floors and caps of (q, r)."""
-    assert isinstance(model.w, Uniform)
-    assert isinstance(model.e, Uniform)
-    return (
-        np.r_[np.broadcast_to(model.w.at_least, model.nx), np.broadcast_to(model.e.at_least, model.ny)].astype(float),
-        np.r_[np.broadcast_to(model.w.at_most, model.nx), np.broadcast_to(model.e.at_most, model.ny)].astype(float),
-    )
 
 
 def largest(rho: Array, floor: Array) -> Array:

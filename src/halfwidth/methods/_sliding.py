@@ -27,13 +27,12 @@ from halfwidth.methods._linearised import (
     expected,
     filled,
     growth,
-    half_width_bounds,
     rows_of,
     scaled_costs,
     start_theta,
 )
 from halfwidth.methods._protocol import Estimator, pushed_row, typed
-from halfwidth.methods._residuals import reference, residuals
+from halfwidth.methods._residuals import half_width_bounds, reference, residuals
 from halfwidth.methods._sites import groups
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.posterior import Posterior

@@ -34,9 +34,9 @@ import numpy as np
 
 from halfwidth.array import Array, real
 from halfwidth.errors import BadShape, BadValue
-from halfwidth.methods._linearised import LinearRows, Rows, filled, half_width_bounds, largest, rows_of, start_theta
+from halfwidth.methods._linearised import LinearRows, Rows, filled, largest, rows_of, start_theta
 from halfwidth.methods._protocol import typed
-from halfwidth.methods._residuals import residuals, unseen_directions
+from halfwidth.methods._residuals import half_width_bounds, residuals, unseen_directions
 from halfwidth.model import Linear, Model, needs_a_box
 from halfwidth.noise import Uniform
 from halfwidth.record import Record

@@ -37,8 +37,9 @@ from numpy.typing import NDArray
 import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadValue, Refused
-from halfwidth.methods._linearised import expected, half_width_bounds
+from halfwidth.methods._linearised import expected
 from halfwidth.methods._protocol import Estimator, typed
+from halfwidth.methods._residuals import half_width_bounds
 from halfwidth.methods._sliding import (
     TOL,
     Forecasts,
