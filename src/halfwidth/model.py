@@ -19,7 +19,8 @@ from halfwidth.derivative import differences
 from halfwidth.errors import BadShape, BadValue, Refused
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
 from halfwidth.spread import Box, Halfspaces, Normal
-from halfwidth.trace import Untraceable, compiled
+from halfwidth.tape import Untraceable
+from halfwidth.trace import compiled
 from halfwidth.varying import Varying, varying
 
 Prior = Box | Normal

@@ -17,7 +17,8 @@ from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.solvers.banded import Chain, chain_of, solve
 from halfwidth.spread import Box, Normal
-from halfwidth.trace import Tape, Untraceable, compiled
+from halfwidth.tape import Tape, Untraceable
+from halfwidth.trace import compiled
 
 #: Rounds in which the scale of each group is found for a nonlinear model.
 _SCALINGS = 3
