@@ -503,6 +503,6 @@ def test_fill_on_a_map_within_limits(log, tmp_path):
     assert found.returncode == GOOD, found.stderr
     assert json.loads(found.stdout)["method"] == "paper002"
     wrong = done("fill", str(log), "-o", str(tmp_path / "other.csv"), "--limits", "speed")
-    assert wrong.returncode == BAD
+    assert wrong.returncode == USAGE
     assert b"NAME=SIZE" in wrong.stderr
     assert done(*given, "--force", "--method", "em").returncode == BAD
