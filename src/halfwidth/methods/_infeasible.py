@@ -23,7 +23,9 @@ from halfwidth.array import Array
 from halfwidth.methods._task import Task
 from halfwidth.model import Linear
 from halfwidth.record import Record
-from halfwidth.solvers.lp import HIGHS, Program, Solution, Solver, Verdict, solve
+from halfwidth.solvers.lp import Solution, solve
+from halfwidth.solvers.program import Program, Solver, Verdict
+from halfwidth.solvers.stock import HIGHS
 
 #: Excesses below this share of sigma count as 0.
 _ZERO = 1e-5

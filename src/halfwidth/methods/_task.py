@@ -18,7 +18,8 @@ from halfwidth.record import Record
 from halfwidth.result import Status
 from halfwidth.solvers.banded import Answer, Chain, Shifted, chain_of
 from halfwidth.solvers.banded import solve as structured
-from halfwidth.solvers.lp import Program, Solution
+from halfwidth.solvers.lp import Solution
+from halfwidth.solvers.program import Program
 from halfwidth.spread import Box
 
 #: Residuals, half-widths and excesses below this share of sigma count as 0.

@@ -47,7 +47,9 @@ from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.solvers.banded import BANDED
 from halfwidth.solvers.banded import solve as structured
-from halfwidth.solvers.lp import HIGHS, PIQP, Solution, Solver, Verdict, highs, solve
+from halfwidth.solvers.lp import Solution, solve
+from halfwidth.solvers.program import Solver, Verdict
+from halfwidth.solvers.stock import HIGHS, PIQP, highs
 from halfwidth.spread import Box
 
 _SOLVERS: dict[str, tuple[Solver, ...]] = {

@@ -296,7 +296,8 @@ def central_gain(*, quick: bool = False) -> Table:
     """Filter error of the central point beside the optimal point and a simplex vertex."""
     from halfwidth.methods._sliding import window_starts
     from halfwidth.methods.window import window_chain
-    from halfwidth.solvers.lp import HIGHS, solve
+    from halfwidth.solvers.lp import solve
+    from halfwidth.solvers.stock import HIGHS
 
     every, seeds = (40, range(1)) if quick else (40, range(3))
     memory, body = 25, []
