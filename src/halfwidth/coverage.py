@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from halfwidth.array import Array, real
-from halfwidth.errors import BadShape, BadValue, Missing, Refused
+from halfwidth.errors import BadShape, BadValue, Refused
 from halfwidth.result import Estimate
+from halfwidth.show import pyplot
 
 #: Probability of the bands.
 _BAND = 0.99
@@ -286,10 +287,4 @@ def _band(p: Array, trials: int) -> tuple[Array, Array]:
 
 
 def _axes(ax: Any) -> Any:
-    if ax is not None:
-        return ax
-    try:
-        from matplotlib.pyplot import subplots
-    except ImportError:
-        raise Missing("`plot` needs matplotlib, which is not installed", hint="pip install halfwidth[plot]") from None
-    return subplots(figsize=(5, 5), layout="constrained")[1]
+    return pyplot().subplots(figsize=(5, 5), layout="constrained")[1] if ax is None else ax

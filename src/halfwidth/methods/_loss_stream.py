@@ -7,7 +7,7 @@ import numpy as np
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.errors import BadRecord, HalfwidthError, Refused
+from halfwidth.errors import BadRecord, HalfwidthError, Refused, hinted
 from halfwidth.loss import Bernoulli, Modes
 from halfwidth.methods._loss_rows import Rows, linear_rows, outputs_and_modes, received, tangent
 from halfwidth.methods._protocol import typed
@@ -64,8 +64,8 @@ class LossStream:
         if reason is None and fixed:
             reason = f"`{fixed[0].name}` is stacked row by row\nhint: give it as a function of dt"
         if reason is not None:
-            message, _, hint = reason.partition("\nhint: ")
-            raise Refused(message, hint=hint or None)
+            message, hint = hinted(reason)
+            raise Refused(message, hint=hint)
         self.method, self.model = method, model
         self._seed = 0 if seed is None else int(seed)
         self.pushed, self.loglik, self.t = 0, 0.0, float(t)

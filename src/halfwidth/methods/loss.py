@@ -26,7 +26,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 import halfwidth._core as _core
-from halfwidth.errors import BadValue, Refused
+from halfwidth.errors import BadValue, Refused, hinted
 from halfwidth.loss import Bernoulli, Loss, Markov
 from halfwidth.methods._loss_law import learn, updated
 from halfwidth.methods._loss_rows import Rows, about, linear_rows, outputs_and_modes, received
@@ -161,8 +161,8 @@ class LossMethod:
         """
         reason = self.refuses(model)
         if reason is not None:
-            message, _, hint = reason.partition("\nhint: ")
-            raise Refused(message, hint=hint or None)
+            message, hint = hinted(reason)
+            raise Refused(message, hint=hint)
         number = 0 if seed is None else int(seed)
         loss = model.loss
         learned: dict[str, Any] = {}

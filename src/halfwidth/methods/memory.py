@@ -33,6 +33,7 @@ from halfwidth.methods.posterior import Answer, Posterior
 from halfwidth.methods.window import Window
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record
+from halfwidth.show import pyplot
 
 #: Sweeps, agreement of moments and damping at nodes, where the evidence of two chains is compared.
 _SWEEPS, _CLOSE, _DAMPING = 100, 1e-4, 0.7
@@ -84,14 +85,8 @@ class MemoryChoice:
         Missing
             If matplotlib is not installed.
         """
-        try:
-            import matplotlib.pyplot as plt
-        except ImportError as exc:
-            from halfwidth.errors import Missing
-
-            raise Missing("`plot` needs matplotlib", hint="pip install 'halfwidth[plot]'") from exc
         if ax is None:
-            _, ax = plt.subplots()
+            _, ax = pyplot().subplots()
         value = self.score if self.evidence is None else self.evidence
         ax.errorbar(self.memories, value, yerr=self.spread, marker="o", capsize=3)
         ax.axvline(self.best, linestyle="--", color="grey")
