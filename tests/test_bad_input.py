@@ -134,6 +134,8 @@ CASES = {
     "u of other length": (lambda: hw.Record([0.0], [1.0], one(1)), hw.BadShape, "`u`"),
     "without a span": (lambda: hw.Record([0.0], [1.0]).without(2.0, 1.0), hw.BadValue, "t0 <= t1"),
     "extended by nothing": (lambda: hw.Record([0.0], [1.0]).extended(0), hw.BadValue, "steps"),
+    "extended by a step back": (lambda: hw.Record([0.0], [1.0]).extended(1, dt=-1.0), hw.BadValue, "`dt` is -1.0"),
+    "extended by a step of NaN": (lambda: hw.Record([0.0], [1.0]).extended(1, dt=np.nan), hw.BadValue, "`dt` is nan"),
     "extended without inputs": (lambda: hw.Record([0.0], [1.0], [1.0]).extended(1), hw.BadRecord, "u="),
     # the front door
     "model is a matrix": (lambda: hw.estimate(I2, hw.Record([0.0], [1.0])), hw.BadValue, "Linear(...)"),

@@ -64,6 +64,13 @@ class Coverage:
     def plot(self, ax: Any = None, *, label: str | None = None) -> Any:
         """Draw found against asked with the band, and return the axes; several go into one `ax`.
 
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            New ones if absent.
+        label : str, optional
+            In the legend; the method if absent.
+
         Raises
         ------
         Missing
@@ -118,7 +125,17 @@ class Ranks:
     def of(cls, values: ArrayLike, bins: int = 20) -> "Ranks":
         """Return the histogram of ranks scaled to 0 .. 1, (n,) independent ones or (n, k) with k of each trial.
 
-        Such as the share of the draws of a posterior that lie below the truth.
+        Parameters
+        ----------
+        values : (n,) or (n, k) array_like
+            Such as the share of the draws of a posterior that lie below the truth.
+        bins : int
+            Bars of the histogram, at least 2.
+
+        Raises
+        ------
+        BadValue
+            If there are no values, one is not in 0 .. 1, or bins are too few.
         """
         given = real(values, "values")
         table = given.reshape(len(given), -1)
@@ -150,6 +167,13 @@ class Ranks:
 
     def plot(self, ax: Any = None, *, label: str | None = None) -> Any:
         """Draw the histogram with its band and return the axes.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            New ones if absent.
+        label : str, optional
+            In the legend.
 
         Raises
         ------

@@ -80,6 +80,11 @@ class MemoryChoice:
     def plot(self, ax: Any = None) -> Any:
         """Draw evidence, or the score where there is none, against memory; returns the axes.
 
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            New ones if absent.
+
         Raises
         ------
         Missing

@@ -67,6 +67,12 @@ class Roads:
     def read(cls, path: str | os.PathLike[str], *, usual: float = USUAL) -> "Roads":
         """Read a GeoJSON file; see `of`.
 
+        Parameters
+        ----------
+        path : str or path
+        usual : float
+            As for `of`.
+
         Raises
         ------
         BadValue
