@@ -9,6 +9,7 @@ I2 = np.eye(2)
 C = [[1.0, 0.0]]
 G, S = hw.Gaussian(0.1), hw.Gaussian(1.0)
 X0 = hw.Normal([0.0, 0.0], 1.0)
+THREE = hw.Record([0.0, 1.0, 2.0], [1.0, None, 3.0])
 
 
 def linear(**changes):
@@ -188,6 +189,15 @@ CASES = {
     ),
     "box without ends as Gaussian": (lambda: linear(x0=None).as_gaussian(), hw.Refused, "x0=Normal"),
     "simulate without a length": (lambda: hw.simulate(linear()), hw.BadValue, "T=100"),
+    "simulate with a number for inputs": (lambda: hw.simulate(linear(), 100), hw.BadShape, "simulate(model, T=100)"),
+    "simulate at a number": (lambda: hw.simulate(linear(), t=3.0), hw.BadShape, "`t` is 3, a row for each time"),
+    "a density that is a noise": (lambda: hw.from_continuous(I2, None, C, G, S, X0), hw.BadValue, "spectral density"),
+    "no memory to choose": (
+        lambda: hw.choose_memory(linear(), THREE, memories=()),
+        hw.BadValue,
+        "memories=(5, 15, 50)",
+    ),
+    "a memory for a model that is refused": (lambda: hw.choose_memory(linear(), THREE), hw.Refused, "uniform noise"),
     "simulate unknown entries": (lambda: hw.simulate(linear(A=[[np.nan, 0], [0, 1]]), T=3), hw.BadValue, "unknown"),
     "simulate unknown half-widths": (lambda: hw.simulate(linear(w=hw.Uniform.unknown()), T=3), hw.Refused, "known"),
     "simulate from a box without ends": (lambda: hw.simulate(linear(x0=None), T=3), hw.BadValue, "finite Box"),

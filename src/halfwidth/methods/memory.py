@@ -23,7 +23,7 @@ import numpy as np
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.errors import BadValue
+from halfwidth.errors import BadValue, Refused, hinted
 from halfwidth.methods._linearised import expected, filled
 from halfwidth.methods._protocol import Estimator
 from halfwidth.methods._sites import Sites, sites
@@ -129,9 +129,17 @@ def choose_memory(
     Raises
     ------
     BadValue
-        If no row is left to be foretold.
+        If there are no memories, or no row is left to be foretold.
+    Refused
+        If the method cannot work on the model.
     """
     method = BatchLP() if method is None else method
+    if not len(memories):
+        raise BadValue("`memories` is empty, numbers of rows were expected", hint="memories=(5, 15, 50)")
+    reason = Window(method, min(memories), recall=recall).refuses(model)
+    if reason is not None:
+        message, hint = hinted(reason)
+        raise Refused(message, hint=hint)
     first = min(max(memories), len(record) // 2)
     if not record.seen[max(first, 1) :].any():
         raise BadValue(f"`record` has no output to foretell after its first {first} rows", hint="a longer record")
