@@ -212,6 +212,24 @@ CASES = {
         hw.BadValue,
         "no row",
     ),
+    "score during one time": (
+        lambda: hw.score(hw.estimate(linear(), THREE), np.ones((3, 2)), during=5.0),
+        hw.BadValue,
+        "two times in seconds",
+    ),
+    "score of no such state": (
+        lambda: hw.score(hw.estimate(linear(), THREE), np.ones((3, 2)), states=[2]),
+        hw.BadValue,
+        "from 0 to 1",
+    ),
+    "kappa below 0": (lambda: hw.ensemble_interval(hw.estimate(linear(), THREE), -1.0), hw.BadValue, "kappa=1.0"),
+    "models without names": (lambda: hw.compare([linear()], THREE), hw.BadValue, "models by name"),
+    "a number for a model": (lambda: hw.compare({"a": linear(), "b": 3}, THREE), hw.BadValue, "`models` has 3 under"),
+    "half-widths unknown on a stream": (
+        lambda: hw.stream(linear(w=hw.Uniform.unknown(), e=hw.Uniform.unknown(), x0=None)),
+        hw.Refused,
+        "hint: stream(model, Window(Posterior(), memory=25))",
+    ),
     "outputs that are not there": (
         lambda: hw.Record([0.0, 1.0], [1.0, 2.0]).without(0, 1, outputs=[3]),
         hw.BadValue,

@@ -338,7 +338,11 @@ def ensemble_interval(estimate: Estimate, kappa: float = 1.0, *, newest: bool = 
     ------
     Refused
         If the estimate is not one of `Window`.
+    BadValue
+        If `kappa` is below 0 or not finite.
     """
+    if not 0.0 <= kappa < np.inf:
+        raise BadValue(f"`kappa` is {kappa!r}, a finite number from 0 was expected", hint="kappa=1.0")
     names = ("newest_low", "newest_high", "newest_windows") if newest else ("low", "high", "windows")
     if names[-1] not in estimate.info:
         raise Refused(f"`{estimate.method}` is no `Window`, so its states have one estimate each")
