@@ -220,8 +220,8 @@ def coverage(estimates: Estimate | Sequence[Estimate], truths: Any, *, levels: A
     --------
     >>> import halfwidth as hw
     >>> walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(0.1), hw.Gaussian(1.0), hw.Normal([0.0], 1.0))
-    >>> truth, record = hw.simulate(walk, T=200, seed=1)
-    >>> hw.coverage(hw.estimate(walk, record), truth).honest
+    >>> drawn = [hw.simulate(walk, T=50, seed=seed) for seed in range(20)]
+    >>> hw.coverage([hw.estimate(walk, record) for _, record in drawn], [truth for truth, _ in drawn]).honest
     True
     """
     ests, true = _pairs(estimates, truths)
