@@ -6,7 +6,7 @@ import numpy as np
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.methods.sequential import expected, growth
+from halfwidth.methods._linearised import expected, growth
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.spread import Box
