@@ -128,10 +128,9 @@ class Posterior:
     --------
     >>> import halfwidth as hw
     >>> walk = hw.Linear([[1]], None, [[1]], hw.Uniform(1.0), hw.Uniform(0.5), hw.Box(-10, 10))
-    >>> est = hw.estimate(walk, hw.Record([0.0, 1.0, 2.0], [0.0, None, 3.0]), hw.Posterior())
-    >>> lo, hi = est.interval(0.9)
-    >>> bool(np.all(lo[-1] >= 1.5) and np.all(hi[-1] <= 2.51))  # |x0| <= .5, two steps of 1, |x2 - 3| <= .5
-    True
+    >>> est = hw.estimate(walk, hw.Record([0.0, 1.0, 2.0], [0.0, None, 2.0]), hw.Posterior())
+    >>> est.x[1].round(3)  # the missing one, halfway
+    array([1.])
     """
 
     method: Literal["ep", "sample"] = "ep"

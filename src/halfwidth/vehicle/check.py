@@ -200,7 +200,7 @@ def check(log: Any) -> Check:
 
     Examples
     --------
-    >>> log = Log(t=range(5), lat_deg=[50.0] * 5, lon_deg=[14.0] * 5, speed_mps=[0.0] * 5)
+    >>> log = Log(t=range(20), lat_deg=[50.0] * 20, lon_deg=[14.0] * 20, speed_mps=[0.0] * 20)
     >>> check(log)["standstill"].value
     1.0
     """
