@@ -405,17 +405,17 @@ struct Ep {
             for (int j = 0; j < n; j++) Ph[j] = Ps[i * n + j];
             return;
         }
-        V h[cap];
+        V h[cap], mean = -target(k), var(0.0);
         row(k, h);
-        *z = -target(k);
-        *v = V(0.0);
         for (int i = 0; i < n; i++) {
-            V q(0.0);
-            for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
+            V q = Ps[i * n] * h[0];
+            for (int j = 1; j < n; j++) q += Ps[i * n + j] * h[j];
             Ph[i] = q;
-            *v += h[i] * q;
-            *z += h[i] * ms[i];
+            var += h[i] * q;
+            mean += h[i] * ms[i];
         }
+        *z = mean;
+        *v = var;
     }
 
     // what a site on a residual of covariance Ph with the state makes of its belief ms, Ps
@@ -449,8 +449,8 @@ struct Ep {
                     }
                 }
                 if (kind(k) == noise_gaussian) continue;
+                if (silent(k) && out_of_reach(k, ms, Ps)) continue;
                 project(k, ms, Ps, Ph[count], z + count, v + count);
-                if (silent(k) && far_inside(k, z[count], v[count])) continue;
                 cavity[count] = cavity_of(k, z[count], larger(v[count], V(1e-300)));
                 if constexpr (!renew) look_at(t, k, z[count], v[count], cavity[count], f);
                 says[count++] = k;
@@ -545,9 +545,17 @@ struct Ep {
         slopes(k, q, v, f);
     }
     // both ends of a bound out of reach in every lane
-    inline bool far_inside(int k, const V& z, const V& v) const {
-        const X up = a.hi[k] - z.v, down = z.v - a.lo[k], least = reach * v.v + 1e-300;
-        return !any4((up < X{}) | (down < X{}) | (up * up < least) | (down * down < least) | (v.v != v.v));
+    inline bool out_of_reach(int k, const V* ms, const V* Ps) const {
+        V z, v;
+        if (const int i = s.axis[k]; i >= 0) {
+            z = ms[i] - target(k);
+            v = Ps[i * n + i];
+        } else {
+            V Ph[cap];
+            project(k, ms, Ps, Ph, &z, &v);
+        }
+        const X up = a.hi[k] - z.v, down = z.v - a.lo[k], least = reach * v.v + 1e-300, near = min4(up, down);
+        return !any4((near < X{}) | (near * near < least) | (v.v != v.v));
     }
 
     // the cavity of row k; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
@@ -685,8 +693,7 @@ struct Ep {
     // Whether every lane that is alive has agreed within `quiet` in a stage, after `before` in those gone over so far.
     bool still(EpFound& f, const V& before, double quiet) const {
         bool calm = quiet > 0.0;
-        for (int l = 0; l < wide_lanes; l++)
-            if (alive(f, l) && !(f.residual[l] < quiet * quiet)) calm = false;
+        for (int l = 0; calm && l < wide_lanes; l++) calm = !alive(f, l) || f.residual[l] < quiet * quiet;
         f.residual = larger(before, f.residual);
         return calm;
     }
@@ -1276,14 +1283,14 @@ struct Ep {
         reach = min2(max2(2.0 * std::log(1e3 / max2(tol, 1e-300)), 20.0), 72.0);
         faint = min2(max2(2e-3 * tol, 1e-13), 1e-4);
     }
-    // What a sweep finds it then mends: what is left is expected to fall at the rate seen, at best to a quarter. Rows with
+    // What a sweep finds it then mends: what is left is expected to fall at the rate seen, at best to a fifth. Rows with
     // two explanations keep no rate.
     bool settled(const EpFound& f, const V& before, double tol) const {
         if (mixed) return within(f, f.residual, tol);
         V left = f.residual;
         for (int l = 0; l < wide_lanes; l++)
-            if (before[l] < 1e300) left.set(l, left[l] * min2(max2(left[l] / before[l], 0.25), 1.0));
-        return within(f, left, 0.7 * tol);
+            if (before[l] < 1e300) left.set(l, left[l] * min2(max2(left[l] / before[l], 0.2), 1.0));
+        return within(f, left, tol);
     }
     // whether `left` is below tol on average over the lanes that are alive, and not far above in any
     bool within(const EpFound& f, const V& left, double tol) const {
