@@ -180,6 +180,7 @@ struct EpCross {
     V *W;       // (T+1, n, n): covariance of w_t
     V *w3, *w4; // (T+1, n): cumulants of the sites of w over the variance's powers 3 and 4
     V *r3, *r4; // (rows,): of the rows
+    V *x3, *x4; // (T+1, n): third and fourth cumulants of the states
 };
 
 template <class N>
@@ -889,15 +890,18 @@ struct Ep {
             }
     }
 
-    // What log Z lacks, to second order in what the sites leave out (Opper, Paquet and Winther 2013): every two factors
-    // with tilted cumulants k_r add k_r k_r' (Cov(z, z') / (Var(z) Var(z')))^r / r!, r = 3 and 4, up to `shape_reach` rows apart.
-    // Rows with two explanations are left out: theirs is no small correction.
-    V second() const {
+    // What the factors' shapes add, whose tilted distributions have the cumulants k_r, r = 3 and 4. To log Z, to second
+    // order (Opper, Paquet and Winther 2013; returned): every two of them k_r k_r' (Cov(z, z') / (Var(z) Var(z')))^r / r!.
+    // To the cumulants of a state, to first order (from stage `shaped` on, into k3 and k4, standardised): each of them
+    // (Cov(x, z) / Var(z))^r k_r. What is more than `shape_reach` rows away counts as Gaussian: it adds with the r-th power
+    // of a small correlation. Log Z leaves out rows with two explanations: theirs is no small correction.
+    V second(double* k3, double* k4) const {
         V total(0.0), R[shape_reach][cap * cap], C[shape_reach][cap * cap];
         for (int k = 0; k < a.rows; k++)
-            s.bends[k] = kind(k) != noise_gaussian && single(k) && any4((cross.r3[k].v != X{}) | (cross.r4[k].v != X{}));
+            s.bends[k] = kind(k) != noise_gaussian && any4((cross.r3[k].v != X{}) | (cross.r4[k].v != X{}));
+        for (int k = 0; k < (a.T + 1) * n; k++) cross.x3[k] = cross.x4[k] = V(0.0);
         for (int t = 0; t <= a.T; t++) {
-            V M[cap * cap], W[cap * cap], h[cap];
+            V M[cap * cap], W[cap * cap], h[cap], cov[cap];
             int last = 0;
             for (int l = 1; l <= shape_reach && t + l <= a.T; l++) {
                 const int u = t + l;
@@ -920,23 +924,54 @@ struct Ep {
             for (int i = 0; i < n; i++) {
                 if (!has_site(t, i)) continue;
                 const V w3 = cross.w3[t * n + i], w4 = cross.w4[t * n + i];
+                bend(t, M + i * n, w3, w4);
                 for (int j = 0; j < i; j++) pair(cross.W[t * n * n + i * n + j], w3, w4, cross.w3[t * n + j], cross.w4[t * n + j], total);
                 with_rows(t, a.start[t], M + i * n, w3, w4, total);
                 later(t, last, W + i * n, w3, w4, C, R, total);
             }
             for (int k = a.start[t]; k < a.start[t + 1]; k++) {
                 if (!s.bends[k]) continue;
-                V Sh[cap];
                 row(k, h);
-                for (int i = 0; i < n; i++) {
-                    Sh[i] = V(0.0);
-                    for (int j = 0; j < n; j++) Sh[i] += S[i * n + j] * h[j];
+                along(S, h, cov);
+                bend(t, cov, cross.r3[k], cross.r4[k]);
+                V none(0.0), &sum = single(k) ? total : none;
+                with_rows(t, k + 1, cov, cross.r3[k], cross.r4[k], sum);
+                later(t, last, h, cross.r3[k], cross.r4[k], C, R, sum);
+            }
+            for (int l = 0; l < last && t >= shaped; l++) {  // what comes later bends x_t
+                const int u = t + l + 1;
+                for (int j = 0; j < n; j++) {
+                    if (!has_site(u, j)) continue;
+                    for (int i = 0; i < n; i++) cov[i] = C[l][i * n + j];
+                    bend(t, cov, cross.w3[u * n + j], cross.w4[u * n + j]);
                 }
-                with_rows(t, k + 1, Sh, cross.r3[k], cross.r4[k], total);
-                later(t, last, h, cross.r3[k], cross.r4[k], C, R, total);
+                for (int k = a.start[u]; k < a.start[u + 1]; k++) {
+                    if (!s.bends[k]) continue;
+                    row(k, h);
+                    along(R[l], h, cov);
+                    bend(t, cov, cross.r3[k], cross.r4[k]);
+                }
             }
         }
+        for (int t = shaped; t <= a.T; t++)
+            for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++) {
+                const std::ptrdiff_t at = (static_cast<std::ptrdiff_t>(block.first + l) * (a.T + 1) + t) * n;
+                for (int i = 0; i < n; i++) {
+                    const double v = max2(cross.S[(t * n + i) * n + i][l], 1e-300), sd = std::sqrt(v);
+                    k3[at + i] = cross.x3[t * n + i][l] / (v * sd);
+                    k4[at + i] = cross.x4[t * n + i][l] / (v * v);
+                }
+            }
         return total;
+    }
+    // what a factor of covariance cov with x_t adds to the cumulants of x_t
+    inline void bend(int t, const V* cov, const V& a3, const V& a4) const {
+        if (t < shaped) return;
+        for (int i = 0; i < n; i++) {
+            const V cube = cov[i] * cov[i] * cov[i];
+            cross.x3[t * n + i] += cube * a3;
+            cross.x4[t * n + i] += cube * cov[i] * a4;
+        }
     }
     inline void pair(const V& c, const V& a3, const V& a4, const V& b3, const V& b4, V& total) const {
         const V cube = c * c * c;
@@ -945,7 +980,7 @@ struct Ep {
     // with the rows of stage t from k on, given the covariance with x_t
     inline void with_rows(int t, int k, const V* cov, const V& a3, const V& a4, V& total) const {
         for (; k < a.start[t + 1]; k++) {
-            if (!s.bends[k]) continue;
+            if (!s.bends[k] || !single(k)) continue;
             if (s.axis[k] >= 0) {
                 pair(cov[s.axis[k]], a3, a4, cross.r3[k], cross.r4[k], total);
                 continue;
@@ -971,90 +1006,22 @@ struct Ep {
                 cov[j] = q;
                 if (has_site(u, j)) pair(c, a3, a4, cross.w3[u * n + j], cross.w4[u * n + j], total);
             }
+            bend(u, cov, a3, a4);
             with_rows(u, a.start[u], cov, a3, a4, total);
         }
     }
-
-    // Third and fourth cumulants of the states, to first order in what the sites leave out: a factor whose tilted
-    // distribution has the cumulant k_r adds (Cov(x, z) / Var(z))^r k_r. Factors more than `shape_reach` rows away count as
-    // Gaussian: they add with the r-th power of a small correlation. Of the stages from `shaped` on.
-    void shapes(double* k3, double* k4) const {
-        for (int t = shaped; t <= a.T; t++) {
-            V c3[cap], c4[cap], R[cap * cap], M[cap * cap];
-            for (int i = 0; i < n; i++) c3[i] = c4[i] = V(0.0);
-            const V* S = cross.S + t * n * n;
-            rows_shape(t, S, c3, c4);
-            noise_shape(t, cross.X1 + t * n * n, c3, c4);
-            for (int side = 0; side < 2; side++) {
-                for (int i = 0; i < n * n; i++) {
-                    R[i] = S[i];
-                    M[i] = V(i % (n + 1) == 0 ? 1.0 : 0.0);
-                }
-                for (int l = 1; l <= shape_reach; l++) {
-                    const int u = side == 0 ? t + l : t - l;
-                    if (u < 0 || u > a.T) break;
-                    if (l > 1) gain(R, side == 0 ? u - 1 : u + 1, M);  // Cov(x_t, x_v) Cov(x_v)^-1, v next to u
-                    if (side == 0) {
-                        V C[cap * cap];
-                        product(M, cross.X0 + u * n * n, C);
-                        noise_shape(u, C, c3, c4);
-                        product(M, cross.B + u * n * n, R);
-                    } else {
-                        product_t(M, cross.B + (u + 1) * n * n, R);
-                        V K[cap * cap], C[cap * cap];
-                        gain(R, u, K);
-                        product(K, cross.X1 + u * n * n, C);
-                        noise_shape(u, C, c3, c4);
-                    }
-                    rows_shape(u, R, c3, c4);
-                }
-            }
-            for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++) {
-                const std::ptrdiff_t at = (static_cast<std::ptrdiff_t>(block.first + l) * (a.T + 1) + t) * n;
-                for (int i = 0; i < n; i++) {
-                    const double v = max2(S[i * n + i][l], 1e-300), sd = std::sqrt(v);
-                    k3[at + i] = c3[i][l] / (v * sd);
-                    k4[at + i] = c4[i][l] / (v * v);
-                }
-            }
+    // out (n,) = R h
+    inline void along(const V* R, const V* h, V* out) const {
+        for (int i = 0; i < n; i++) {
+            out[i] = V(0.0);
+            for (int j = 0; j < n; j++) out[i] += R[i * n + j] * h[j];
         }
-    }
-
-    // covariance R (n,n) of x_t with x_u: what the rows and the noise of u add
-    inline void rows_shape(int u, const V* R, V* c3, V* c4) const {
-        for (int k = a.start[u]; k < a.start[u + 1]; k++) {
-            if (kind(k) == noise_gaussian) continue;
-            V h[cap];
-            row(k, h);
-            for (int i = 0; i < n; i++) {
-                V q(0.0);
-                for (int j = 0; j < n; j++) q += R[i * n + j] * h[j];
-                c3[i] += q * q * q * cross.r3[k];
-                c4[i] += q * q * q * q * cross.r4[k];
-            }
-        }
-    }
-    inline void noise_shape(int u, const V* C, V* c3, V* c4) const {
-        for (int j = 0; j < n; j++)
-            for (int i = 0; i < n; i++) {
-                const V q = C[i * n + j];
-                c3[i] += q * q * q * cross.w3[u * n + j];
-                c4[i] += q * q * q * q * cross.w4[u * n + j];
-            }
     }
     inline void product(const V* M, const V* B, V* out) const {
         for (int i = 0; i < n; i++)
             for (int j = 0; j < n; j++) {
                 V q(0.0);
                 for (int k = 0; k < n; k++) q += M[i * n + k] * B[k * n + j];
-                out[i * n + j] = q;
-            }
-    }
-    inline void product_t(const V* M, const V* B, V* out) const {
-        for (int i = 0; i < n; i++)
-            for (int j = 0; j < n; j++) {
-                V q(0.0);
-                for (int k = 0; k < n; k++) q += M[i * n + k] * B[j * n + k];
                 out[i * n + j] = q;
             }
     }
