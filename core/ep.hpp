@@ -923,20 +923,21 @@ struct Ep {
             gain(M, t, W);  // w_t given x_t
             for (int i = 0; i < n; i++) {
                 if (!has_site(t, i)) continue;
-                const V w3 = cross.w3[t * n + i], w4 = cross.w4[t * n + i];
+                const V w3 = cross.w3[t * n + i], w4 = cross.w4[t * n + i], own3 = w3 * V(1.0 / 6.0), own4 = w4 * V(1.0 / 24.0);
                 bend(t, M + i * n, w3, w4);
-                for (int j = 0; j < i; j++) pair(cross.W[t * n * n + i * n + j], w3, w4, cross.w3[t * n + j], cross.w4[t * n + j], total);
-                with_rows(t, a.start[t], M + i * n, w3, w4, total);
-                later(t, last, W + i * n, w3, w4, C, R, total);
+                V sum = with_rows(t, a.start[t], M + i * n, own3, own4);
+                for (int j = 0; j < i; j++)
+                    sum += pair(cross.W[t * n * n + i * n + j], own3, own4, cross.w3[t * n + j], cross.w4[t * n + j]);
+                total += sum + later(t, last, W + i * n, w3, w4, C, R);
             }
             for (int k = a.start[t]; k < a.start[t + 1]; k++) {
                 if (!s.bends[k]) continue;
+                const V r3 = cross.r3[k], r4 = cross.r4[k];
                 row(k, h);
                 along(S, h, cov);
-                bend(t, cov, cross.r3[k], cross.r4[k]);
-                V none(0.0), &sum = single(k) ? total : none;
-                with_rows(t, k + 1, cov, cross.r3[k], cross.r4[k], sum);
-                later(t, last, h, cross.r3[k], cross.r4[k], C, R, sum);
+                bend(t, cov, r3, r4);
+                const V sum = with_rows(t, k + 1, cov, r3 * V(1.0 / 6.0), r4 * V(1.0 / 24.0)) + later(t, last, h, r3, r4, C, R);
+                if (single(k)) total += sum;
             }
             for (int l = 0; l < last && t >= shaped; l++) {  // what comes later bends x_t
                 const int u = t + l + 1;
@@ -973,27 +974,31 @@ struct Ep {
             cross.x4[t * n + i] += cube * cov[i] * a4;
         }
     }
-    inline void pair(const V& c, const V& a3, const V& a4, const V& b3, const V& b4, V& total) const {
-        const V cube = c * c * c;
-        total += cube * (a3 * b3 * V(1.0 / 6.0) + c * a4 * b4 * V(1.0 / 24.0));
+    // of a factor with the cumulants 6 a3 and 24 a4 and one with b3 and b4, of covariance c
+    static inline V pair(const V& c, const V& a3, const V& a4, const V& b3, const V& b4) {
+        return c * c * c * (a3 * b3 + c * (a4 * b4));
     }
     // with the rows of stage t from k on, given the covariance with x_t
-    inline void with_rows(int t, int k, const V* cov, const V& a3, const V& a4, V& total) const {
+    inline V with_rows(int t, int k, const V* cov, const V& a3, const V& a4) const {
+        V sum(0.0);
         for (; k < a.start[t + 1]; k++) {
             if (!s.bends[k] || !single(k)) continue;
             if (s.axis[k] >= 0) {
-                pair(cov[s.axis[k]], a3, a4, cross.r3[k], cross.r4[k], total);
+                sum += pair(cov[s.axis[k]], a3, a4, cross.r3[k], cross.r4[k]);
                 continue;
             }
             V h[cap], c(0.0);
             row(k, h);
             for (int j = 0; j < n; j++) c += cov[j] * h[j];
-            pair(c, a3, a4, cross.r3[k], cross.r4[k], total);
+            sum += pair(c, a3, a4, cross.r3[k], cross.r4[k]);
         }
+        return sum;
     }
-    // with what comes later, of what acts on x_t as g does; C, R: covariance of x_t with the noise and the state of t + 1, ...
-    inline void later(int t, int last, const V* g, const V& a3, const V& a4, const V (*C)[cap * cap], const V (*R)[cap * cap],
-                      V& total) const {
+    // with what comes later, of what acts on x_t as g does and has the cumulants k3 and k4; C, R: covariance of x_t with the
+    // noise and the state of t + 1, ...
+    inline V later(int t, int last, const V* g, const V& k3, const V& k4, const V (*C)[cap * cap], const V (*R)[cap * cap]) const {
+        const V a3 = k3 * V(1.0 / 6.0), a4 = k4 * V(1.0 / 24.0);
+        V sum(0.0);
         for (int l = 0; l < last; l++) {
             const int u = t + l + 1;
             V cov[cap];
@@ -1004,11 +1009,12 @@ struct Ep {
                     q += g[i] * R[l][i * n + j];
                 }
                 cov[j] = q;
-                if (has_site(u, j)) pair(c, a3, a4, cross.w3[u * n + j], cross.w4[u * n + j], total);
+                if (has_site(u, j)) sum += pair(c, a3, a4, cross.w3[u * n + j], cross.w4[u * n + j]);
             }
-            bend(u, cov, a3, a4);
-            with_rows(u, a.start[u], cov, a3, a4, total);
+            bend(u, cov, k3, k4);
+            sum += with_rows(u, a.start[u], cov, a3, a4);
         }
+        return sum;
     }
     // out (n,) = R h
     inline void along(const V* R, const V* h, V* out) const {
