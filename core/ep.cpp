@@ -12,7 +12,7 @@ std::size_t marks(const EpArgs& a) { return (2 * std::size_t(a.rows) + sizeof(V)
 
 std::size_t block_size(const EpArgs& a) {
     const std::size_t stages = a.T + 1, n = a.n;
-    const std::size_t shape = a.k3 ? stages * (6 * n * n + 2 * n) + 2 * std::size_t(a.rows) : 0;
+    const std::size_t shape = a.k3 ? stages * (6 * n * n + 4 * n) + 2 * std::size_t(a.rows) : 0;
     return stages * (2 * n + n * (n + 1)) + stages * 2 * n + 2 * std::size_t(a.rows) + 5 * std::size_t(a.groups) + 4 + marks(a) + shape;
 }
 
@@ -58,6 +58,8 @@ void settle_in(Ep<N>& ep, EpFound& f, Place& place) {
     c.w4 = place.take(stages * n);
     c.r3 = place.take(a.rows);
     c.r4 = place.take(a.rows);
+    c.x3 = place.take(stages * n);
+    c.x4 = place.take(stages * n);
 }
 
 template <class N>
@@ -96,8 +98,7 @@ int run(N n, const EpArgs& a) {
         const int used = a.sweeps > 0 ? ep.settle(f, a.sweeps, a.tol, a.damping) : 0;
         ep.cross = wanted;
         ep.look(f);
-        if (a.k3) ep.shapes(a.k3, a.k4);
-        const V more = a.k3 && a.more ? ep.second() : V(0.0);
+        const V more = a.k3 ? ep.second(a.k3, a.k4) : V(0.0);
         for (int l = 0; l < wide_lanes && first + l < a.members; l++) {
             const std::ptrdiff_t k = first + l;
             a.log_z[k] = ep.sound(f, l) ? f.log_z[l] : minus_inf;

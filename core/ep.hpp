@@ -180,6 +180,7 @@ struct EpCross {
     V *W;       // (T+1, n, n): covariance of w_t
     V *w3, *w4; // (T+1, n): cumulants of the sites of w over the variance's powers 3 and 4
     V *r3, *r4; // (rows,): of the rows
+    V *x3, *x4; // (T+1, n): third and fourth cumulants of the states
 };
 
 template <class N>
@@ -405,17 +406,17 @@ struct Ep {
             for (int j = 0; j < n; j++) Ph[j] = Ps[i * n + j];
             return;
         }
-        V h[cap];
+        V h[cap], mean = -target(k), var(0.0);
         row(k, h);
-        *z = -target(k);
-        *v = V(0.0);
         for (int i = 0; i < n; i++) {
-            V q(0.0);
-            for (int j = 0; j < n; j++) q += Ps[i * n + j] * h[j];
+            V q = Ps[i * n] * h[0];
+            for (int j = 1; j < n; j++) q += Ps[i * n + j] * h[j];
             Ph[i] = q;
-            *v += h[i] * q;
-            *z += h[i] * ms[i];
+            var += h[i] * q;
+            mean += h[i] * ms[i];
         }
+        *z = mean;
+        *v = var;
     }
 
     // what a site on a residual of covariance Ph with the state makes of its belief ms, Ps
@@ -449,8 +450,8 @@ struct Ep {
                     }
                 }
                 if (kind(k) == noise_gaussian) continue;
+                if (silent(k) && out_of_reach(k, ms, Ps)) continue;
                 project(k, ms, Ps, Ph[count], z + count, v + count);
-                if (silent(k) && far_inside(k, z[count], v[count])) continue;
                 cavity[count] = cavity_of(k, z[count], larger(v[count], V(1e-300)));
                 if constexpr (!renew) look_at(t, k, z[count], v[count], cavity[count], f);
                 says[count++] = k;
@@ -545,9 +546,17 @@ struct Ep {
         slopes(k, q, v, f);
     }
     // both ends of a bound out of reach in every lane
-    inline bool far_inside(int k, const V& z, const V& v) const {
-        const X up = a.hi[k] - z.v, down = z.v - a.lo[k], least = reach * v.v + 1e-300;
-        return !any4((up < X{}) | (down < X{}) | (up * up < least) | (down * down < least) | (v.v != v.v));
+    inline bool out_of_reach(int k, const V* ms, const V* Ps) const {
+        V z, v;
+        if (const int i = s.axis[k]; i >= 0) {
+            z = ms[i] - target(k);
+            v = Ps[i * n + i];
+        } else {
+            V Ph[cap];
+            project(k, ms, Ps, Ph, &z, &v);
+        }
+        const X up = a.hi[k] - z.v, down = z.v - a.lo[k], least = reach * v.v + 1e-300, near = min4(up, down);
+        return !any4((near < X{}) | (near * near < least) | (v.v != v.v));
     }
 
     // the cavity of row k; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
@@ -685,8 +694,7 @@ struct Ep {
     // Whether every lane that is alive has agreed within `quiet` in a stage, after `before` in those gone over so far.
     bool still(EpFound& f, const V& before, double quiet) const {
         bool calm = quiet > 0.0;
-        for (int l = 0; l < wide_lanes; l++)
-            if (alive(f, l) && !(f.residual[l] < quiet * quiet)) calm = false;
+        for (int l = 0; calm && l < wide_lanes; l++) calm = !alive(f, l) || f.residual[l] < quiet * quiet;
         f.residual = larger(before, f.residual);
         return calm;
     }
@@ -882,15 +890,18 @@ struct Ep {
             }
     }
 
-    // What log Z lacks, to second order in what the sites leave out (Opper, Paquet and Winther 2013): every two factors
-    // with tilted cumulants k_r add k_r k_r' (Cov(z, z') / (Var(z) Var(z')))^r / r!, r = 3 and 4, up to `shape_reach` rows apart.
-    // Rows with two explanations are left out: theirs is no small correction.
-    V second() const {
+    // What the factors' shapes add, whose tilted distributions have the cumulants k_r, r = 3 and 4. To log Z, to second
+    // order (Opper, Paquet and Winther 2013; returned): every two of them k_r k_r' (Cov(z, z') / (Var(z) Var(z')))^r / r!.
+    // To the cumulants of a state, to first order (from stage `shaped` on, into k3 and k4, standardised): each of them
+    // (Cov(x, z) / Var(z))^r k_r. What is more than `shape_reach` rows away counts as Gaussian: it adds with the r-th power
+    // of a small correlation. Log Z leaves out rows with two explanations: theirs is no small correction.
+    V second(double* k3, double* k4) const {
         V total(0.0), R[shape_reach][cap * cap], C[shape_reach][cap * cap];
         for (int k = 0; k < a.rows; k++)
-            s.bends[k] = kind(k) != noise_gaussian && single(k) && any4((cross.r3[k].v != X{}) | (cross.r4[k].v != X{}));
+            s.bends[k] = kind(k) != noise_gaussian && any4((cross.r3[k].v != X{}) | (cross.r4[k].v != X{}));
+        for (int k = 0; k < (a.T + 1) * n; k++) cross.x3[k] = cross.x4[k] = V(0.0);
         for (int t = 0; t <= a.T; t++) {
-            V M[cap * cap], W[cap * cap], h[cap];
+            V M[cap * cap], W[cap * cap], h[cap], cov[cap];
             int last = 0;
             for (int l = 1; l <= shape_reach && t + l <= a.T; l++) {
                 const int u = t + l;
@@ -912,46 +923,82 @@ struct Ep {
             gain(M, t, W);  // w_t given x_t
             for (int i = 0; i < n; i++) {
                 if (!has_site(t, i)) continue;
-                const V w3 = cross.w3[t * n + i], w4 = cross.w4[t * n + i];
-                for (int j = 0; j < i; j++) pair(cross.W[t * n * n + i * n + j], w3, w4, cross.w3[t * n + j], cross.w4[t * n + j], total);
-                with_rows(t, a.start[t], M + i * n, w3, w4, total);
-                later(t, last, W + i * n, w3, w4, C, R, total);
+                const V w3 = cross.w3[t * n + i], w4 = cross.w4[t * n + i], own3 = w3 * V(1.0 / 6.0), own4 = w4 * V(1.0 / 24.0);
+                bend(t, M + i * n, w3, w4);
+                V sum = with_rows(t, a.start[t], M + i * n, own3, own4);
+                for (int j = 0; j < i; j++)
+                    sum += pair(cross.W[t * n * n + i * n + j], own3, own4, cross.w3[t * n + j], cross.w4[t * n + j]);
+                total += sum + later(t, last, W + i * n, w3, w4, C, R);
             }
             for (int k = a.start[t]; k < a.start[t + 1]; k++) {
                 if (!s.bends[k]) continue;
-                V Sh[cap];
+                const V r3 = cross.r3[k], r4 = cross.r4[k];
                 row(k, h);
-                for (int i = 0; i < n; i++) {
-                    Sh[i] = V(0.0);
-                    for (int j = 0; j < n; j++) Sh[i] += S[i * n + j] * h[j];
+                along(S, h, cov);
+                bend(t, cov, r3, r4);
+                const V sum = with_rows(t, k + 1, cov, r3 * V(1.0 / 6.0), r4 * V(1.0 / 24.0)) + later(t, last, h, r3, r4, C, R);
+                if (single(k)) total += sum;
+            }
+            for (int l = 0; l < last && t >= shaped; l++) {  // what comes later bends x_t
+                const int u = t + l + 1;
+                for (int j = 0; j < n; j++) {
+                    if (!has_site(u, j)) continue;
+                    for (int i = 0; i < n; i++) cov[i] = C[l][i * n + j];
+                    bend(t, cov, cross.w3[u * n + j], cross.w4[u * n + j]);
                 }
-                with_rows(t, k + 1, Sh, cross.r3[k], cross.r4[k], total);
-                later(t, last, h, cross.r3[k], cross.r4[k], C, R, total);
+                for (int k = a.start[u]; k < a.start[u + 1]; k++) {
+                    if (!s.bends[k]) continue;
+                    row(k, h);
+                    along(R[l], h, cov);
+                    bend(t, cov, cross.r3[k], cross.r4[k]);
+                }
             }
         }
+        for (int t = shaped; t <= a.T; t++)
+            for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++) {
+                const std::ptrdiff_t at = (static_cast<std::ptrdiff_t>(block.first + l) * (a.T + 1) + t) * n;
+                for (int i = 0; i < n; i++) {
+                    const double v = max2(cross.S[(t * n + i) * n + i][l], 1e-300), sd = std::sqrt(v);
+                    k3[at + i] = cross.x3[t * n + i][l] / (v * sd);
+                    k4[at + i] = cross.x4[t * n + i][l] / (v * v);
+                }
+            }
         return total;
     }
-    inline void pair(const V& c, const V& a3, const V& a4, const V& b3, const V& b4, V& total) const {
-        const V cube = c * c * c;
-        total += cube * (a3 * b3 * V(1.0 / 6.0) + c * a4 * b4 * V(1.0 / 24.0));
+    // what a factor of covariance cov with x_t adds to the cumulants of x_t
+    inline void bend(int t, const V* cov, const V& a3, const V& a4) const {
+        if (t < shaped) return;
+        for (int i = 0; i < n; i++) {
+            const V cube = cov[i] * cov[i] * cov[i];
+            cross.x3[t * n + i] += cube * a3;
+            cross.x4[t * n + i] += cube * cov[i] * a4;
+        }
+    }
+    // of a factor with the cumulants 6 a3 and 24 a4 and one with b3 and b4, of covariance c
+    static inline V pair(const V& c, const V& a3, const V& a4, const V& b3, const V& b4) {
+        return c * c * c * (a3 * b3 + c * (a4 * b4));
     }
     // with the rows of stage t from k on, given the covariance with x_t
-    inline void with_rows(int t, int k, const V* cov, const V& a3, const V& a4, V& total) const {
+    inline V with_rows(int t, int k, const V* cov, const V& a3, const V& a4) const {
+        V sum(0.0);
         for (; k < a.start[t + 1]; k++) {
-            if (!s.bends[k]) continue;
+            if (!s.bends[k] || !single(k)) continue;
             if (s.axis[k] >= 0) {
-                pair(cov[s.axis[k]], a3, a4, cross.r3[k], cross.r4[k], total);
+                sum += pair(cov[s.axis[k]], a3, a4, cross.r3[k], cross.r4[k]);
                 continue;
             }
             V h[cap], c(0.0);
             row(k, h);
             for (int j = 0; j < n; j++) c += cov[j] * h[j];
-            pair(c, a3, a4, cross.r3[k], cross.r4[k], total);
+            sum += pair(c, a3, a4, cross.r3[k], cross.r4[k]);
         }
+        return sum;
     }
-    // with what comes later, of what acts on x_t as g does; C, R: covariance of x_t with the noise and the state of t + 1, ...
-    inline void later(int t, int last, const V* g, const V& a3, const V& a4, const V (*C)[cap * cap], const V (*R)[cap * cap],
-                      V& total) const {
+    // with what comes later, of what acts on x_t as g does and has the cumulants k3 and k4; C, R: covariance of x_t with the
+    // noise and the state of t + 1, ...
+    inline V later(int t, int last, const V* g, const V& k3, const V& k4, const V (*C)[cap * cap], const V (*R)[cap * cap]) const {
+        const V a3 = k3 * V(1.0 / 6.0), a4 = k4 * V(1.0 / 24.0);
+        V sum(0.0);
         for (int l = 0; l < last; l++) {
             const int u = t + l + 1;
             V cov[cap];
@@ -962,92 +1009,25 @@ struct Ep {
                     q += g[i] * R[l][i * n + j];
                 }
                 cov[j] = q;
-                if (has_site(u, j)) pair(c, a3, a4, cross.w3[u * n + j], cross.w4[u * n + j], total);
+                if (has_site(u, j)) sum += pair(c, a3, a4, cross.w3[u * n + j], cross.w4[u * n + j]);
             }
-            with_rows(u, a.start[u], cov, a3, a4, total);
+            bend(u, cov, k3, k4);
+            sum += with_rows(u, a.start[u], cov, a3, a4);
         }
+        return sum;
     }
-
-    // Third and fourth cumulants of the states, to first order in what the sites leave out: a factor whose tilted
-    // distribution has the cumulant k_r adds (Cov(x, z) / Var(z))^r k_r. Factors more than `shape_reach` rows away count as
-    // Gaussian: they add with the r-th power of a small correlation. Of the stages from `shaped` on.
-    void shapes(double* k3, double* k4) const {
-        for (int t = shaped; t <= a.T; t++) {
-            V c3[cap], c4[cap], R[cap * cap], M[cap * cap];
-            for (int i = 0; i < n; i++) c3[i] = c4[i] = V(0.0);
-            const V* S = cross.S + t * n * n;
-            rows_shape(t, S, c3, c4);
-            noise_shape(t, cross.X1 + t * n * n, c3, c4);
-            for (int side = 0; side < 2; side++) {
-                for (int i = 0; i < n * n; i++) {
-                    R[i] = S[i];
-                    M[i] = V(i % (n + 1) == 0 ? 1.0 : 0.0);
-                }
-                for (int l = 1; l <= shape_reach; l++) {
-                    const int u = side == 0 ? t + l : t - l;
-                    if (u < 0 || u > a.T) break;
-                    if (l > 1) gain(R, side == 0 ? u - 1 : u + 1, M);  // Cov(x_t, x_v) Cov(x_v)^-1, v next to u
-                    if (side == 0) {
-                        V C[cap * cap];
-                        product(M, cross.X0 + u * n * n, C);
-                        noise_shape(u, C, c3, c4);
-                        product(M, cross.B + u * n * n, R);
-                    } else {
-                        product_t(M, cross.B + (u + 1) * n * n, R);
-                        V K[cap * cap], C[cap * cap];
-                        gain(R, u, K);
-                        product(K, cross.X1 + u * n * n, C);
-                        noise_shape(u, C, c3, c4);
-                    }
-                    rows_shape(u, R, c3, c4);
-                }
-            }
-            for (int l = 0; l < wide_lanes && block.first + l <= block.last; l++) {
-                const std::ptrdiff_t at = (static_cast<std::ptrdiff_t>(block.first + l) * (a.T + 1) + t) * n;
-                for (int i = 0; i < n; i++) {
-                    const double v = max2(S[i * n + i][l], 1e-300), sd = std::sqrt(v);
-                    k3[at + i] = c3[i][l] / (v * sd);
-                    k4[at + i] = c4[i][l] / (v * v);
-                }
-            }
+    // out (n,) = R h
+    inline void along(const V* R, const V* h, V* out) const {
+        for (int i = 0; i < n; i++) {
+            out[i] = V(0.0);
+            for (int j = 0; j < n; j++) out[i] += R[i * n + j] * h[j];
         }
-    }
-
-    // covariance R (n,n) of x_t with x_u: what the rows and the noise of u add
-    inline void rows_shape(int u, const V* R, V* c3, V* c4) const {
-        for (int k = a.start[u]; k < a.start[u + 1]; k++) {
-            if (kind(k) == noise_gaussian) continue;
-            V h[cap];
-            row(k, h);
-            for (int i = 0; i < n; i++) {
-                V q(0.0);
-                for (int j = 0; j < n; j++) q += R[i * n + j] * h[j];
-                c3[i] += q * q * q * cross.r3[k];
-                c4[i] += q * q * q * q * cross.r4[k];
-            }
-        }
-    }
-    inline void noise_shape(int u, const V* C, V* c3, V* c4) const {
-        for (int j = 0; j < n; j++)
-            for (int i = 0; i < n; i++) {
-                const V q = C[i * n + j];
-                c3[i] += q * q * q * cross.w3[u * n + j];
-                c4[i] += q * q * q * q * cross.w4[u * n + j];
-            }
     }
     inline void product(const V* M, const V* B, V* out) const {
         for (int i = 0; i < n; i++)
             for (int j = 0; j < n; j++) {
                 V q(0.0);
                 for (int k = 0; k < n; k++) q += M[i * n + k] * B[k * n + j];
-                out[i * n + j] = q;
-            }
-    }
-    inline void product_t(const V* M, const V* B, V* out) const {
-        for (int i = 0; i < n; i++)
-            for (int j = 0; j < n; j++) {
-                V q(0.0);
-                for (int k = 0; k < n; k++) q += M[i * n + k] * B[j * n + k];
                 out[i * n + j] = q;
             }
     }
@@ -1276,14 +1256,14 @@ struct Ep {
         reach = min2(max2(2.0 * std::log(1e3 / max2(tol, 1e-300)), 20.0), 72.0);
         faint = min2(max2(2e-3 * tol, 1e-13), 1e-4);
     }
-    // What a sweep finds it then mends: what is left is expected to fall at the rate seen, at best to a quarter. Rows with
+    // What a sweep finds it then mends: what is left is expected to fall at the rate seen, at best to a fifth. Rows with
     // two explanations keep no rate.
     bool settled(const EpFound& f, const V& before, double tol) const {
         if (mixed) return within(f, f.residual, tol);
         V left = f.residual;
         for (int l = 0; l < wide_lanes; l++)
-            if (before[l] < 1e300) left.set(l, left[l] * min2(max2(left[l] / before[l], 0.25), 1.0));
-        return within(f, left, 0.7 * tol);
+            if (before[l] < 1e300) left.set(l, left[l] * min2(max2(left[l] / before[l], 0.2), 1.0));
+        return within(f, left, tol);
     }
     // whether `left` is below tol on average over the lanes that are alive, and not far above in any
     bool within(const EpFound& f, const V& left, double tol) const {

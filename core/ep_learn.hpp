@@ -682,8 +682,7 @@ struct EpLearner {
         if (begin == led) recall(at);
         evaluate_inside(at, a.most, a.tol_nodes, value, slope, begin, false);
         if (now.count > 1) hold(k, at);
-        ep.shapes(a.base.k3, a.base.k4);
-        const V more = ep.second();
+        const V more = ep.second(a.base.k3, a.base.k4);
         for (int l = 0; l < wide_lanes && k + l < end; l++) {
             for (int j = 0; j < q; j++) {
                 a.phi[(k + l) * q + j] = at[l][j];
