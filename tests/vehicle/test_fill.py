@@ -9,7 +9,7 @@ from tests.vehicle.known import FRAME, known, real_log
 
 import halfwidth as hw
 from halfwidth.errors import BadLog, BadValue
-from halfwidth.vehicle import calibrate, estimators
+from halfwidth.vehicle import estimators, widening
 from halfwidth.vehicle.fill import fill
 from halfwidth.vehicle.frames import Frame
 from halfwidth.vehicle.grid import sampled
@@ -548,7 +548,7 @@ def test_what_a_method_has_learnt_is_kept_when_fixes_are_hidden(monkeypatch, nam
 
 
 def _shown(name, sizes):
-    return [calibrate.Tested(length, 8, size, size, 0.9, 1.0, by=name, half_m=1.0) for length, size in sizes]
+    return [widening.Tested(length, 8, size, size, 0.9, 1.0, by=name, half_m=1.0) for length, size in sizes]
 
 
 def test_another_way_must_be_better_at_all_lengths_where_the_sensors_speak():

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth.vehicle import calibrate
+from halfwidth.vehicle import calibrate, widening
 from halfwidth.vehicle.estimators import METHODS, Method
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid
@@ -34,7 +34,7 @@ class Bridge:
 
     span: Span
     by: str
-    tested: Sequence[calibrate.Tested]
+    tested: Sequence[widening.Tested]
     least: float
     share: float = 1.0  # of the other way, where it is not the usual one
 
@@ -57,7 +57,7 @@ class Answers:
     slow: Slow | None
 
     @property
-    def tested(self) -> list[calibrate.Tested]:
+    def tested(self) -> list[widening.Tested]:
         """All tests that a half-width rests on."""
         return list(dict.fromkeys(one for bridge in self.bridges for one in bridge.tested))
 
@@ -124,7 +124,7 @@ def estimated(
                     ]
             return ways
 
-        tests: dict[str, list[calibrate.Tested]] = {}
+        tests: dict[str, list[widening.Tested]] = {}
         if good:
             whole = [grids[i] for i in good]
             lengths = calibrate.lengths_to_test(whole, np.array([span.length for span in alike]))
@@ -168,7 +168,7 @@ def estimated(
 
 def _end_tests(
     name: str, grids: Sequence[Grid], good: Sequence[int], rerun: Rerun, spans: Sequence[Span], level: float
-) -> list[calibrate.Tested]:
+) -> list[widening.Tested]:
     """Test half-widths beyond the first and the last fix of a log."""
     if not spans or not good:
         return []
@@ -222,7 +222,7 @@ def _interpolated(shares: Mapping[float, float], length: float) -> float:
     return float(np.interp(np.log(length), np.log(lengths), [shares[one] for one in lengths])) if lengths else 0.0
 
 
-def nearest(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, length: float) -> str:
+def nearest(tests: Mapping[str, Sequence[widening.Tested]], usual: str, length: float) -> str:
     """Return which way came nearest to hidden fixes, and was surest, where the sensors speak.
 
     Another way than the usual one has to be clearly better in stretches about as long as this, and in those of all
@@ -292,7 +292,7 @@ def _failed_words(chosen: Method, pieces: Sequence[Piece], n: int) -> str:
 
 
 def _choice_words(
-    tests: Mapping[str, Sequence[calibrate.Tested]], bridges: Sequence[Bridge], shares: Mapping[float, float]
+    tests: Mapping[str, Sequence[widening.Tested]], bridges: Sequence[Bridge], shares: Mapping[float, float]
 ) -> list[str]:
     """Say how near each way came to hidden fixes, where there was a choice, and which was taken."""
     if len(tests) < 2:
@@ -320,7 +320,7 @@ def _test_words(bridges: Sequence[Bridge], level: float, usual: str) -> list[str
         if not tested:
             found.append(
                 f"too few fixes to test the half-widths{without} on this log: they are the model's own,"
-                f" widened {calibrate.UNTESTED:g} times"
+                f" widened {widening.UNTESTED:g} times"
             )
             continue
         words = "; ".join(
@@ -340,15 +340,15 @@ def _test_words(bridges: Sequence[Bridge], level: float, usual: str) -> list[str
 
 
 def _change(inflation: float, least: float) -> str:
-    factor = max(inflation, least, calibrate.LEAST)
+    factor = max(inflation, least, widening.LEAST)
     return f"widened {factor:.2f} times" if factor >= 1 else f"narrowed to {factor:.2f} times"
 
 
-def _beyond(one: calibrate.Tested) -> str:
+def _beyond(one: widening.Tested) -> str:
     return " beyond the fixes" if one.side == "one" else ""
 
 
-def _without(one: Span | calibrate.Tested) -> str:
+def _without(one: Span | widening.Tested) -> str:
     """Say which sensors are silent, and where."""
     if not one.silent:
         return ""

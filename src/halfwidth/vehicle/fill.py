@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
-from halfwidth.vehicle import calibrate, proven
+from halfwidth.vehicle import proven, widening
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.choice import Answers, estimated
 from halfwidth.vehicle.distrust import distrusted
@@ -398,7 +398,7 @@ def _half_widths(
         rows = (quality != "fix") & (t >= bridge.span.start) & (t <= bridge.span.stop)
         for axis in (0, 1):
             own = sd[rows, axis]
-            half[rows, axis] *= calibrate.inflation(bridge.tested, bridge.span.length, own, level, least=bridge.least)
+            half[rows, axis] *= widening.inflation(bridge.tested, bridge.span.length, own, level, least=bridge.least)
     # twice: both the estimate and the vehicle are within reach of the nearest fix
     limit = 2 * top_speed(grid) * away + z * np.sqrt(columns.fix_variance) + 10.0
     return np.minimum(half, limit[:, None])

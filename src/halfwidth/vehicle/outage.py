@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue, Missing
 from halfwidth.vehicle.align import calibrated
-from halfwidth.vehicle.calibrate import FEWEST, factor_for
+from halfwidth.vehicle.calibrate import FEWEST
 from halfwidth.vehicle.estimators import METHODS, Method, method, usable
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import Log, to_frame
 from halfwidth.vehicle.path import Path, sized
 from halfwidth.vehicle.stamps import restamped
+from halfwidth.vehicle.widening import factor_for
 
 Floats = NDArray[np.float64]
 
