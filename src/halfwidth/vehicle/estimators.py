@@ -73,6 +73,8 @@ class Method:
     again : function (drives, paths, tuned) -> list of Path, optional
         Fills the same drives with fixes hidden, with what their paths with all fixes have learnt; `run`, which learns
         again, if absent.
+    afresh : function (drives, paths, tuned) -> list of Path, optional
+        The same where sensors are hidden as well, which the paths must not tell; `run` if absent.
     run : function (drives, tuned) -> list of Path
     tune : function (drive) -> mapping
         What it learns from the whole log, once.
@@ -86,6 +88,7 @@ class Method:
     tune: Callable[[Grid], Tuned] = lambda drive: _NOTHING  # noqa: ARG005
     one_of: tuple[str, ...] = ()
     again: Callable[[Sequence[Grid], Sequence[Path], Tuned], list[Path]] | None = None
+    afresh: Callable[[Sequence[Grid], Sequence[Path], Tuned], list[Path]] | None = None
 
     def lacks(self, drive: Grid) -> str | None:
         """Return in words the sensor that the drive does not have, or None."""
@@ -475,6 +478,7 @@ METHODS: Mapping[str, Method] = MappingProxyType(
                 lambda drive: {"inflation": tube.inflation_of(drive)},
                 one_of=_SENSORS,
                 again=lambda drives, paths, tuned: tube.again(drives, paths, _tube(tuned)),
+                afresh=lambda drives, paths, tuned: tube.again(drives, paths, _tube(tuned), afresh=True),
             ),
             Method(
                 "paper000",

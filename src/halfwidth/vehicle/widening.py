@@ -14,12 +14,12 @@ read together: the logarithm of the factor is taken to be
 
 with Gaussian a, b and c (`_SIZE`, `_SLOPE_BY_SD`, `_SLOPE_BY_LENGTH`), about the middle of what was tested, and
 Ornstein-Uhlenbeck processes f and g (`_BEND`): a model whose errors grow faster or slower than it says goes on doing so
-in gaps up to twice (`_BEYOND`) as long as the log can test. Each group shows it with the variance of a sample quantile of n Gaussian
-errors, p (1 - p) / (2 z phi(z))^2 / n, times the square of how much further the quantiles about the wanted one lie
-apart than those of a Gaussian (`Tested.tail`): where most stretches are easy and a few are hard, the quantile is known
-much less well. For n a stretch counts as three in each group (errors at one place of it are alike), or as one where a
-sensor is missing. These sizes make the hidden stretches of three real logs and sixteen simulated drives most probable,
-and were not chosen by what intervals then hold.
+in gaps up to twice (`_BEYOND`) as long as the log can test. Each group shows it with the variance of a sample quantile
+of n Gaussian errors, p (1 - p) / (2 z phi(z))^2 / n, times the square of how much further the quantiles about the
+wanted one lie apart than those of a Gaussian (`Tested.tail`): where most stretches are easy and a few are hard, the
+quantile is known much less well. For n a stretch counts as three in each group (errors at one place of it are alike),
+or as one where a sensor is missing. These sizes make what hidden stretches of three real logs and of sixteen simulated
+drives ask for about as probable as any do; they were not chosen by how often intervals then hold.
 
 That gives the logarithm of the factor for any s and L, and its variance v. The interval is the one that holds as often
 as wanted if the logarithm is Gaussian and errors are (`_widened`), so that few stretches give a wide interval and not a
