@@ -115,12 +115,12 @@ def estimated(
             ways = {chosen.name: first}
             for name, rival in against.items():
                 both = list(zip(first, rival.rerun(own, hidden, guessed), hidden, strict=True))
-                ways[name] = [_bridged(a, b, grid, _even(_pauses(grid), 1.0)) for a, b, grid in both]
+                ways[name] = [_bridged(a, b, grid, _even(_pauses(grid), 1.0), guessed) for a, b, grid in both]
                 if guessed:
                     length, share = _share(first, ways[name], [grids[i] for i in own], hidden)
                     shares[length] = share
                     ways[_mixed(chosen.name, name)] = [
-                        _bridged(a, b, grid, _even(_pauses(grid), share)) for a, b, grid in both
+                        _bridged(a, b, grid, _even(_pauses(grid), share), guessed) for a, b, grid in both
                     ]
             return ways
 
@@ -153,7 +153,7 @@ def estimated(
         both = (name, _mixed(chosen.name, name))
         taken = [(bridge.span.start, bridge.span.stop, bridge.share) for bridge in bridges if bridge.by in both]
         for i, path in rival.paths.items():
-            paths[i] = _bridged(paths[i], path, grids[i], taken)
+            paths[i] = _bridged(paths[i], path, grids[i], taken, name == "cv")
     answers = Answers(paths, bridges, settings, slow)
     settings.update(
         {
@@ -250,13 +250,16 @@ def _pauses(grid: Grid) -> list[tuple[float, float]]:
     return [(float(grid.t[seen[k]]), float(grid.t[seen[k + 1]])) for k in apart]
 
 
-def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, float, float]]) -> Path:
+def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, float, float]], guessed: bool) -> Path:
     """Take a share of another path between the fixes on both sides of some stretches, where it is shifted to meet this.
 
     Each stretch is its beginning, its end and the share. Errors of the two may be alike, so deviations are averaged.
+    Where what the vehicle did is `guessed` the other path is taken from the first to the last node at which a sensor is
+    silent: up to there this one is carried by the sensors.
     """
     seen = np.flatnonzero(grid.seen)
     t = grid.t[seen]
+    silent = np.flatnonzero(_silent(grid)) if guessed else np.arange(len(grid))
     columns: dict[str, Any] = {name: np.array(getattr(path, name)) for name in ("east", "north", "azimuth", "speed")}
     if path.variance is None or other.variance is None:
         return path
@@ -266,9 +269,20 @@ def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, f
         right = int(np.searchsorted(t, stop - 1e-6))
         if left < 0 or right >= seen.size or seen[right] - seen[left] < 2:
             continue
-        a, b = seen[left], seen[right]
+        lost = silent[(silent > seen[left]) & (silent <= seen[right])]
+        if not lost.size:
+            continue
+        # between fixes all of it; elsewhere the first and the last of the steps are silent only in part
+        a = seen[left] if lost[0] == seen[left] + 1 else lost[0]
+        b = seen[right] if lost[-1] == seen[right] else lost[-1] - 1
+        if b - a < 2:
+            continue
         inside = slice(a + 1, b)
         share = (grid.t[inside] - grid.t[a]) / (grid.t[b] - grid.t[a])
+
+        def between(variance: Floats, share: Floats = share, a: int = a, b: int = b) -> Floats:
+            return np.asarray(variance[a] + share[:, None] * (variance[b] - variance[a]))
+
         for name, own in columns.items():
             new = getattr(other, name)
             before, after = own[a] - new[a], own[b] - new[b]
@@ -276,10 +290,22 @@ def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, f
                 before, after = float(wrapped(before)), float(wrapped(after))
             apart = new[inside] + (1 - share) * before + share * after - own[inside]
             own[inside] += part * (wrapped(apart) if name == "azimuth" else apart)
-        # a path says by itself how far fixes lie about it; what is kept is the sum
-        new = np.maximum(other.variance[inside] + other.fix_variance - path.fix_variance, 0.0)
-        variance[inside] = ((1 - part) * np.sqrt(variance[inside]) + part * np.sqrt(new)) ** 2
+        if guessed:  # what the other is less sure of between its ends, on top of what this one is not sure of there
+            more = np.maximum(other.variance[inside] - between(other.variance), 0.0)
+            wide = between(path.variance) + more
+        else:  # a path says by itself how far fixes lie about it; what is kept is the sum
+            wide = np.maximum(other.variance[inside] + other.fix_variance - path.fix_variance, 0.0)
+        variance[inside] = ((1 - part) * np.sqrt(variance[inside]) + part * np.sqrt(wide)) ** 2
     return replace(path, **columns, variance=variance)
+
+
+def _silent(grid: Grid) -> NDArray[np.bool_]:
+    """Return to which nodes the step lacks a sensor, (T,)."""
+    lost = [
+        getattr(grid, f"{name}_sd") > 0 if getattr(grid, f"has_{name}") else np.ones(len(grid), dtype=bool)
+        for name in ("speed", "yaw_rate")
+    ]
+    return np.asarray(lost[0] | lost[1])
 
 
 def _failed_words(chosen: Method, pieces: Sequence[Piece], n: int) -> str:
