@@ -9,7 +9,8 @@ import halfwidth as hw
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle.estimators import METHODS
 from halfwidth.vehicle.log import Log
-from halfwidth.vehicle.outage import Cell, Outages, outages
+from halfwidth.vehicle.outage import outages
+from halfwidth.vehicle.outage_table import Cell, Outages
 
 FAST = ("linear", "cv", "em")
 
