@@ -1,10 +1,12 @@
 """The factor on a standard deviation: right for any size, near the wanted share from few stretches, never absurd."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from halfwidth.vehicle import widening
-from halfwidth.vehicle.widening import factor_for, inflation, quantile
+from halfwidth.vehicle.widening import factor_for, inflation, quantile, tail_of
 
 LEVEL, Z = 0.9, 1.6448536
 
@@ -64,3 +66,34 @@ def test_a_quantile_of_few_errors_is_enlarged_and_of_many_is_their_own():
     few = [quantile(errors[k : k + 2], np.ones(2), LEVEL, 2) for k in range(0, 4000, 2)]
     assert np.median(few) == pytest.approx(Z, rel=0.1)
     assert quantile(np.zeros(3), np.ones(3), LEVEL, 3) == 0.0
+
+
+def test_a_trend_with_the_length_goes_on_up_to_twice_what_was_tested():
+    found = [one(length, (0.3, 0.5 * (length / 5.0) ** 0.4, 300.0)) for length in (5.0, 10.0, 20.0, 40.0)]
+    at = [inflation(found, length, np.array([0.3]), LEVEL, least=0.0)[0] for length in (40.0, 60.0, 80.0, 1000.0)]
+    assert at[0] < at[1] < at[2]
+    assert at[2] == pytest.approx(0.5 * 16**0.4, rel=0.1)
+    assert at[3] == pytest.approx(at[2])
+
+
+def test_a_quantile_among_few_hard_places_is_less_sure():
+    rng = np.random.default_rng(2)
+    alike = [np.abs(rng.standard_normal(50)) for _ in range(200)]
+    hard = [one * (8.0 if k % 8 == 0 else 1.0) for k, one in enumerate(alike)]
+    assert tail_of(alike, LEVEL) == pytest.approx(1.0, abs=0.15)
+    assert tail_of(hard, LEVEL) > 2.5
+    assert tail_of([np.zeros(3)], LEVEL) == 1.0
+    sure, unsure = (
+        inflation([dataclasses.replace(one(10.0, (1.0, 1.0, 12.0)), tail=tail)], 10.0, np.ones(1), LEVEL, least=0.0)[0]
+        for tail in (1.0, 3.0)
+    )
+    assert 1.0 < sure < unsure < 2.0
+
+
+@pytest.mark.parametrize("level", [0.8, 0.9, 0.99])
+@pytest.mark.parametrize("variance", [0.01, 0.1, 0.5])
+def test_an_interval_whose_size_is_unsure_holds_as_often_as_wanted(variance, level):
+    rng = np.random.default_rng(3)
+    half = widening._z(level) * widening._widened(level, np.array([variance]))[0]
+    held = np.abs(rng.standard_normal(200_000)) <= half * np.exp(np.sqrt(variance) * rng.standard_normal(200_000))
+    assert held.mean() == pytest.approx(level, abs=0.003)
