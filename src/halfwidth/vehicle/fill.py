@@ -3,11 +3,11 @@
 A log that was written late is put at the times at which its sensors spoke (`stamps`); the track has the stamps of the
 log. It is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
 gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened or
-narrowed by what hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate
-too are tested by hiding these as well, and filled by the mean of the chain and of constant velocity, weighted by what
-came nearest to hidden fixes; where they speak, the chain whose fixes are wrong by white noise only is taken if hidden
-fixes show that to be clearly better (`choice`). A method that fails on a piece is replaced by a simpler one there, and
-the track says so.
+narrowed by what hiding the log's own fixes shows (`calibrate`, `widening`). Gaps in which the log lacks the speed or
+the yaw rate too are tested by hiding these as well, and filled where they are silent by the mean of the chain and of
+constant velocity, weighted by what came nearest to hidden fixes; where they speak, the chain whose fixes are wrong by
+white noise only is taken if hidden fixes show that to be clearly better (`choice`). A method that fails on a piece is
+replaced by a simpler one there, and the track says so.
 
 Positions are those that the receiver would have reported, and the half-widths say how far off they are: hidden fixes
 lie within them as often as `level` says, on this log. What the receiver is wrong by for minutes at a time is in the
