@@ -61,7 +61,7 @@ UNTESTED = 2.0
 LEAST = 0.1
 
 #: Variances of a logarithm for which the widening is tabulated.
-_VARIANCES = np.concatenate(([0.0], np.geomspace(1e-3, 4.0, 60)))
+_VARIANCES = np.concatenate(([0.0], np.geomspace(1e-3, 4.0, 30)))
 
 
 @dataclass(frozen=True)
@@ -314,7 +314,7 @@ def _table(level: float) -> Floats:
     found = []
     for spread in np.sqrt(_VARIANCES):
         low, high = 1.0, 200.0  # few stretches narrow no interval
-        for _ in range(40):
+        for _ in range(24):
             tried = float(np.sqrt(low * high))
             held = sum(
                 w * (2 * normal.cdf(z * tried * float(np.exp(-spread * u))) - 1)
