@@ -11,8 +11,8 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("ci")
 
-DATA = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data"
 BENCHMARKS = pathlib.Path(__file__).resolve().parents[1] / "benchmarks"
+DATA = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @pytest.fixture(scope="session")
@@ -23,16 +23,16 @@ def data():
     return DATA
 
 
-@pytest.fixture(scope="module")
-def benchmark_named():
-    """Return a benchmark as a module; what it imports from its neighbours is found beside it."""
-
-    def loaded(name):
-        spec = importlib.util.spec_from_file_location(f"bench_{name}", BENCHMARKS / f"{name}.py")
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        return module
-
+@pytest.fixture(scope="session")
+def bench():
+    """Load a benchmark as a module; what it imports from its neighbours is found beside it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(BENCHMARKS))
-        yield loaded
+
+        def load(name):
+            spec = importlib.util.spec_from_file_location(f"bench_{name}", BENCHMARKS / f"{name}.py")
+            module = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+            return module
+
+        yield load

@@ -94,8 +94,8 @@ def test_a_lag_lies_between_filter_and_smoother():
     np.testing.assert_allclose((lo[11], hi[11]), (low, high), atol=1e-3 * (high - low).min())
 
 
-def test_no_violation_in_a_hundred_thousand_state_steps(benchmark_named):
-    bench = benchmark_named("hull")
+def test_no_violation_in_a_hundred_thousand_state_steps(bench):
+    bench = bench("hull")
     steps = wrong = loose = sides = 0
     seed = 0
     while steps < 100_000:

@@ -8,8 +8,8 @@ from halfwidth.vehicle.fill import fill, prepared
 
 
 @pytest.fixture(scope="module")
-def accuracy(benchmark_named):
-    return benchmark_named("accuracy")
+def accuracy(bench):
+    return bench("accuracy")
 
 
 @pytest.mark.parametrize("name", ["linear", "cv", "em"])

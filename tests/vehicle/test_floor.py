@@ -12,8 +12,8 @@ AT, JUMP, OUTAGE, CALM, LENGTH = 120.0, 2.0, 115.0, 60.0, 10.0
 
 
 @pytest.fixture(scope="module")
-def floor(benchmark_named):
-    return benchmark_named("floor")
+def floor(bench):
+    return bench("floor")
 
 
 @pytest.fixture(scope="module")
