@@ -9,7 +9,7 @@ from tests.vehicle.known import FRAME, known, real_log
 
 import halfwidth as hw
 from halfwidth.errors import BadLog, BadValue
-from halfwidth.vehicle import calibrate, estimators
+from halfwidth.vehicle import estimators, widening
 from halfwidth.vehicle.fill import fill
 from halfwidth.vehicle.frames import Frame
 from halfwidth.vehicle.grid import sampled
@@ -511,6 +511,25 @@ def test_a_sensor_that_is_silent_for_a_part_of_a_gap_is_hidden_for_that_part():
     assert means[0] < means[1]
 
 
+def test_where_the_sensors_speak_no_other_path_is_mixed_in():
+    made = drive(duration=300.0)
+    inside = (made.log.t >= 100) & (made.log.t <= 120)
+    grid = sampled(dataclasses.replace(made.log, speed_mps=np.where(inside, NAN, made.log.speed_mps)))
+    grid = grid.without(92, 128)
+    own = dataclasses.replace(estimators.METHODS["linear"].run([grid], {})[0], variance=np.ones((len(grid), 2)))
+    bent = dataclasses.replace(own, east=own.east + np.sin(grid.t), variance=4 * np.ones((len(grid), 2)))
+    mixed = importlib.import_module("halfwidth.vehicle.choice")._bridged
+    half = mixed(own, bent, grid, [(91.9, 128.1, 0.5)], True)
+    apart = np.abs(half.east - own.east)
+    speaks = (grid.t < 99.5) | (grid.t > 120.5)
+    assert apart[~speaks].max() > 0.3
+    assert apart[speaks].max() == 0.0
+    np.testing.assert_array_equal(half.variance[speaks], own.variance[speaks])
+    # where the sensors speak throughout, and what the vehicle did is not guessed, all of the gap is
+    all_of_it = mixed(own, bent, grid, [(91.9, 128.1, 0.5)], False)
+    assert np.abs(all_of_it.east - own.east)[(grid.t > 93) & (grid.t < 99)].max() > 0.3
+
+
 def test_untested_half_widths_have_a_floor(data):
     log = real_log(data, "driveplotr")
     shares = []
@@ -548,7 +567,7 @@ def test_what_a_method_has_learnt_is_kept_when_fixes_are_hidden(monkeypatch, nam
 
 
 def _shown(name, sizes):
-    return [calibrate.Tested(length, 8, size, size, 0.9, 1.0, by=name, half_m=1.0) for length, size in sizes]
+    return [widening.Tested(length, 8, size, size, 0.9, 1.0, by=name, half_m=1.0) for length, size in sizes]
 
 
 def test_another_way_must_be_better_at_all_lengths_where_the_sensors_speak():

@@ -83,6 +83,17 @@ def test_a_logger_that_hangs_in_a_gap_is_found_by_its_clockwork():
     assert restamped(dark)[0] is dark
 
 
+@pytest.mark.parametrize("turned", [162.0, 164.0, 166.0, 168.0])
+def test_a_pause_beside_a_gap_in_which_the_car_turns_round_is_none(turned):
+    t = np.arange(0.0, 400.0)
+    t = t[(t < 100) | (t >= 145)]
+    north = 10.0 * np.minimum(t, 2 * turned - t) + 0.03 * np.random.default_rng(0).standard_normal(t.size)
+    log = Log(t=t, lat_deg=50.0 + north / 111_229.0, lon_deg=np.full(t.size, 14.0), speed_mps=np.full(t.size, 10.0))
+    assert leaps(log) == ()
+    # only the first fix after the pause is left
+    assert leaps(log.without(145.5, 187.0)) == ()
+
+
 def test_a_leap_and_a_logger_that_hangs_are_found_together():
     log, said = _drive(seconds=200.0)
     written = said + _hung(said)

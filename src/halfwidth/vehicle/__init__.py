@@ -17,7 +17,7 @@ _HOME: dict[str, str] = {
     "Limits": "formats",
     "Log": "log",
     "METHODS": "estimators",
-    "Outages": "outage",
+    "Outages": "outage_table",
     "Roads": "roads",
     "Track": "track",
     "calibrated": "align",
@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     from halfwidth.vehicle.models import gps_ins as gps_ins
     from halfwidth.vehicle.models import two_antenna as two_antenna
     from halfwidth.vehicle.models import two_antenna_linear as two_antenna_linear
-    from halfwidth.vehicle.outage import Outages as Outages
     from halfwidth.vehicle.outage import outages as outages
+    from halfwidth.vehicle.outage_table import Outages as Outages
     from halfwidth.vehicle.roads import Roads as Roads
     from halfwidth.vehicle.sensors import Calibration as Calibration
     from halfwidth.vehicle.track import Gap as Gap

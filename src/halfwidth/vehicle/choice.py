@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth.vehicle import calibrate
+from halfwidth.vehicle import calibrate, widening
 from halfwidth.vehicle.estimators import METHODS, Method
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid
@@ -34,7 +34,7 @@ class Bridge:
 
     span: Span
     by: str
-    tested: Sequence[calibrate.Tested]
+    tested: Sequence[widening.Tested]
     least: float
     share: float = 1.0  # of the other way, where it is not the usual one
 
@@ -57,7 +57,7 @@ class Answers:
     slow: Slow | None
 
     @property
-    def tested(self) -> list[calibrate.Tested]:
+    def tested(self) -> list[widening.Tested]:
         """All tests that a half-width rests on."""
         return list(dict.fromkeys(one for bridge in self.bridges for one in bridge.tested))
 
@@ -115,16 +115,16 @@ def estimated(
             ways = {chosen.name: first}
             for name, rival in against.items():
                 both = list(zip(first, rival.rerun(own, hidden, guessed), hidden, strict=True))
-                ways[name] = [_bridged(a, b, grid, _even(_pauses(grid), 1.0)) for a, b, grid in both]
+                ways[name] = [_bridged(a, b, grid, _even(_pauses(grid), 1.0), guessed) for a, b, grid in both]
                 if guessed:
                     length, share = _share(first, ways[name], [grids[i] for i in own], hidden)
                     shares[length] = share
                     ways[_mixed(chosen.name, name)] = [
-                        _bridged(a, b, grid, _even(_pauses(grid), share)) for a, b, grid in both
+                        _bridged(a, b, grid, _even(_pauses(grid), share), guessed) for a, b, grid in both
                     ]
             return ways
 
-        tests: dict[str, list[calibrate.Tested]] = {}
+        tests: dict[str, list[widening.Tested]] = {}
         if good:
             whole = [grids[i] for i in good]
             lengths = calibrate.lengths_to_test(whole, np.array([span.length for span in alike]))
@@ -153,7 +153,7 @@ def estimated(
         both = (name, _mixed(chosen.name, name))
         taken = [(bridge.span.start, bridge.span.stop, bridge.share) for bridge in bridges if bridge.by in both]
         for i, path in rival.paths.items():
-            paths[i] = _bridged(paths[i], path, grids[i], taken)
+            paths[i] = _bridged(paths[i], path, grids[i], taken, name == "cv")
     answers = Answers(paths, bridges, settings, slow)
     settings.update(
         {
@@ -168,7 +168,7 @@ def estimated(
 
 def _end_tests(
     name: str, grids: Sequence[Grid], good: Sequence[int], rerun: Rerun, spans: Sequence[Span], level: float
-) -> list[calibrate.Tested]:
+) -> list[widening.Tested]:
     """Test half-widths beyond the first and the last fix of a log."""
     if not spans or not good:
         return []
@@ -222,7 +222,7 @@ def _interpolated(shares: Mapping[float, float], length: float) -> float:
     return float(np.interp(np.log(length), np.log(lengths), [shares[one] for one in lengths])) if lengths else 0.0
 
 
-def nearest(tests: Mapping[str, Sequence[calibrate.Tested]], usual: str, length: float) -> str:
+def nearest(tests: Mapping[str, Sequence[widening.Tested]], usual: str, length: float) -> str:
     """Return which way came nearest to hidden fixes, and was surest, where the sensors speak.
 
     Another way than the usual one has to be clearly better in stretches about as long as this, and in those of all
@@ -250,13 +250,16 @@ def _pauses(grid: Grid) -> list[tuple[float, float]]:
     return [(float(grid.t[seen[k]]), float(grid.t[seen[k + 1]])) for k in apart]
 
 
-def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, float, float]]) -> Path:
+def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, float, float]], guessed: bool) -> Path:
     """Take a share of another path between the fixes on both sides of some stretches, where it is shifted to meet this.
 
     Each stretch is its beginning, its end and the share. Errors of the two may be alike, so deviations are averaged.
+    Where what the vehicle did is `guessed` the other path is taken from the first to the last node at which a sensor is
+    silent: up to there this one is carried by the sensors.
     """
     seen = np.flatnonzero(grid.seen)
     t = grid.t[seen]
+    silent = np.flatnonzero(_silent(grid)) if guessed else np.arange(len(grid))
     columns: dict[str, Any] = {name: np.array(getattr(path, name)) for name in ("east", "north", "azimuth", "speed")}
     if path.variance is None or other.variance is None:
         return path
@@ -266,9 +269,20 @@ def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, f
         right = int(np.searchsorted(t, stop - 1e-6))
         if left < 0 or right >= seen.size or seen[right] - seen[left] < 2:
             continue
-        a, b = seen[left], seen[right]
+        lost = silent[(silent > seen[left]) & (silent <= seen[right])]
+        if not lost.size:
+            continue
+        # between fixes all of it; elsewhere the first and the last of the steps are silent only in part
+        a = seen[left] if lost[0] == seen[left] + 1 else lost[0]
+        b = seen[right] if lost[-1] == seen[right] else lost[-1] - 1
+        if b - a < 2:
+            continue
         inside = slice(a + 1, b)
         share = (grid.t[inside] - grid.t[a]) / (grid.t[b] - grid.t[a])
+
+        def between(variance: Floats, share: Floats = share, a: int = a, b: int = b) -> Floats:
+            return np.asarray(variance[a] + share[:, None] * (variance[b] - variance[a]))
+
         for name, own in columns.items():
             new = getattr(other, name)
             before, after = own[a] - new[a], own[b] - new[b]
@@ -276,10 +290,22 @@ def _bridged(path: Path, other: Path, grid: Grid, spans: Sequence[tuple[float, f
                 before, after = float(wrapped(before)), float(wrapped(after))
             apart = new[inside] + (1 - share) * before + share * after - own[inside]
             own[inside] += part * (wrapped(apart) if name == "azimuth" else apart)
-        # a path says by itself how far fixes lie about it; what is kept is the sum
-        new = np.maximum(other.variance[inside] + other.fix_variance - path.fix_variance, 0.0)
-        variance[inside] = ((1 - part) * np.sqrt(variance[inside]) + part * np.sqrt(new)) ** 2
+        if guessed:  # what the other is less sure of between its ends, on top of what this one is not sure of there
+            more = np.maximum(other.variance[inside] - between(other.variance), 0.0)
+            wide = between(path.variance) + more
+        else:  # a path says by itself how far fixes lie about it; what is kept is the sum
+            wide = np.maximum(other.variance[inside] + other.fix_variance - path.fix_variance, 0.0)
+        variance[inside] = ((1 - part) * np.sqrt(variance[inside]) + part * np.sqrt(wide)) ** 2
     return replace(path, **columns, variance=variance)
+
+
+def _silent(grid: Grid) -> NDArray[np.bool_]:
+    """Return to which nodes the step lacks a sensor, (T,)."""
+    lost = [
+        getattr(grid, f"{name}_sd") > 0 if getattr(grid, f"has_{name}") else np.ones(len(grid), dtype=bool)
+        for name in ("speed", "yaw_rate")
+    ]
+    return np.asarray(lost[0] | lost[1])
 
 
 def _failed_words(chosen: Method, pieces: Sequence[Piece], n: int) -> str:
@@ -292,7 +318,7 @@ def _failed_words(chosen: Method, pieces: Sequence[Piece], n: int) -> str:
 
 
 def _choice_words(
-    tests: Mapping[str, Sequence[calibrate.Tested]], bridges: Sequence[Bridge], shares: Mapping[float, float]
+    tests: Mapping[str, Sequence[widening.Tested]], bridges: Sequence[Bridge], shares: Mapping[float, float]
 ) -> list[str]:
     """Say how near each way came to hidden fixes, where there was a choice, and which was taken."""
     if len(tests) < 2:
@@ -320,7 +346,7 @@ def _test_words(bridges: Sequence[Bridge], level: float, usual: str) -> list[str
         if not tested:
             found.append(
                 f"too few fixes to test the half-widths{without} on this log: they are the model's own,"
-                f" widened {calibrate.UNTESTED:g} times"
+                f" widened {widening.UNTESTED:g} times"
             )
             continue
         words = "; ".join(
@@ -340,15 +366,15 @@ def _test_words(bridges: Sequence[Bridge], level: float, usual: str) -> list[str
 
 
 def _change(inflation: float, least: float) -> str:
-    factor = max(inflation, least, calibrate.LEAST)
+    factor = max(inflation, least, widening.LEAST)
     return f"widened {factor:.2f} times" if factor >= 1 else f"narrowed to {factor:.2f} times"
 
 
-def _beyond(one: calibrate.Tested) -> str:
+def _beyond(one: widening.Tested) -> str:
     return " beyond the fixes" if one.side == "one" else ""
 
 
-def _without(one: Span | calibrate.Tested) -> str:
+def _without(one: Span | widening.Tested) -> str:
     """Say which sensors are silent, and where."""
     if not one.silent:
         return ""

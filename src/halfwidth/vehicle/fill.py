@@ -3,11 +3,11 @@
 A log that was written late is put at the times at which its sensors spoke (`stamps`); the track has the stamps of the
 log. It is put on one clock, cut into pieces of some minutes with a minute of context on both sides (never inside a
 gap), each piece is estimated by the best method that the log's sensors allow, and the half-widths are widened or
-narrowed by what hiding the log's own fixes shows (`calibrate`). Gaps in which the log lacks the speed or the yaw rate
-too are tested by hiding these as well, and filled by the mean of the chain and of constant velocity, weighted by what
-came nearest to hidden fixes; where they speak, the chain whose fixes are wrong by white noise only is taken if hidden
-fixes show that to be clearly better (`choice`). A method that fails on a piece is replaced by a simpler one there, and
-the track says so.
+narrowed by what hiding the log's own fixes shows (`calibrate`, `widening`). Gaps in which the log lacks the speed or
+the yaw rate too are tested by hiding these as well, and filled where they are silent by the mean of the chain and of
+constant velocity, weighted by what came nearest to hidden fixes; where they speak, the chain whose fixes are wrong by
+white noise only is taken if hidden fixes show that to be clearly better (`choice`). A method that fails on a piece is
+replaced by a simpler one there, and the track says so.
 
 Positions are those that the receiver would have reported, and the half-widths say how far off they are: hidden fixes
 lie within them as often as `level` says, on this log. What the receiver is wrong by for minutes at a time is in the
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
-from halfwidth.vehicle import calibrate, proven
+from halfwidth.vehicle import proven, widening
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.choice import Answers, estimated
 from halfwidth.vehicle.distrust import distrusted
@@ -398,7 +398,7 @@ def _half_widths(
         rows = (quality != "fix") & (t >= bridge.span.start) & (t <= bridge.span.stop)
         for axis in (0, 1):
             own = sd[rows, axis]
-            half[rows, axis] *= calibrate.inflation(bridge.tested, bridge.span.length, own, level, least=bridge.least)
+            half[rows, axis] *= widening.inflation(bridge.tested, bridge.span.length, own, level, least=bridge.least)
     # twice: both the estimate and the vehicle are within reach of the nearest fix
     limit = 2 * top_speed(grid) * away + z * np.sqrt(columns.fix_variance) + 10.0
     return np.minimum(half, limit[:, None])

@@ -131,10 +131,11 @@ def _plain(
     whole: dict[int, Path] = {}
 
     def rerun(which: Sequence[int], hidden: Sequence[Grid], afresh: bool) -> list[Path]:
-        if afresh or chosen.again is None:
+        kept = chosen.afresh if afresh else chosen.again
+        if kept is None or not whole:
             paths = chosen.run(hidden, tuned)
         else:
-            paths = chosen.again(hidden, [whole[i] for i in which], tuned)
+            paths = kept(hidden, [whole[i] for i in which], tuned)
         return [sized(path, grid) for path, grid in zip(paths, hidden, strict=True)]
 
     whole.update(zip(able, rerun(able, [grids[i] for i in able], True), strict=True))

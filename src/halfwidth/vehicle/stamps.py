@@ -189,6 +189,9 @@ def leaps(log: Log) -> tuple[tuple[float, float], ...]:
         last, first = np.searchsorted(rows, k, side="right") - 1, np.searchsorted(rows, k + 1)
         near = (log.t[k] - fixes[last] < every + usual) and (fixes[first] - log.t[k + 1] < every + usual)
         pairs = np.arange(min(beside, last + 1, rows.size - first))
+        # across another gap the car may have turned, and a straight line is shorter than its way
+        far = np.maximum(log.t[k] - fixes[last - pairs], fixes[first + pairs] - log.t[k + 1])
+        pairs = pairs[far < 1.5 * beside * every]
         pace = float(np.interp(log.t[[k, k + 1]], clock, np.abs(speed)).mean())
         if not near or not pairs.size or pace < FAST:
             continue

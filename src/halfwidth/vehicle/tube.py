@@ -8,7 +8,7 @@ half-width the band. The band is as good as learnt half-widths are: it is no gua
 other. What is declared instead of learnt is in `halfwidth.vehicle.proven`.
 
 A set knows no averages, so neighbouring fixes tell it little that is new: it is computed on nodes about a second
-apart, whose speed is that of the chord between them, asked for at all of these in gaps and at every third elsewhere,
+apart, whose speed is that of the chord between them, asked for at every third of these and beside each end of a gap,
 and carried to the nodes of the drive along the path of the bounded chain in its elastic form, which also leaves out
 fixes that nothing explains.
 """
@@ -43,8 +43,11 @@ _STRETCHES, _HIDDEN, _CONTEXT = 8, 15.0, 20.0
 #: Share of the worst rows whose mean counts where fixes are screened.
 _ELASTIC = 0.1
 
-#: Nodes with a fix that count on each side of a node; of nodes with fixes on both sides every so many is asked for.
+#: Nodes with a fix that count on each side of a node; of nodes every so many is asked for.
 _NEAR, _EVERY = 20, 3
+
+#: Programs that learn again where sensors are hidden, from azimuths between those on both sides.
+_AFRESH = 2
 
 #: Times that a tube without any path is inflated further, and by how much.
 _FURTHER, _MORE = 3, 1.5
@@ -88,7 +91,9 @@ def solve(drives: Sequence[Grid], settings: Tube = Tube()) -> list[Path]:
     return [_solved(with_speed(drive), settings) for drive in drives]
 
 
-def again(drives: Sequence[Grid], paths: Sequence[Path], settings: Tube = Tube()) -> list[Path]:
+def again(
+    drives: Sequence[Grid], paths: Sequence[Path], settings: Tube = Tube(), *, afresh: bool = False
+) -> list[Path]:
     """Return the centre of the tube for drives of which fixes were hidden, with what was learnt with all fixes.
 
     The half-widths, the azimuths to linearise about and, within each step of the tube, the shape of the path are those
@@ -100,24 +105,37 @@ def again(drives: Sequence[Grid], paths: Sequence[Path], settings: Tube = Tube()
     paths : sequence of Path
         What `solve` found for each with all fixes.
     settings : Tube
+    afresh : bool
+        Whether the half-widths, and shape and azimuths between the fixes that are left, are learnt again without the
+        others: where sensors are hidden as well, the path given would tell what they said.
 
     Returns
     -------
     list of Path
     """
     both = zip(drives, paths, strict=True)
-    return [_again(with_speed(drive), path, settings) for drive, path in both]
+    return [_again(with_speed(drive), path, settings, afresh) for drive, path in both]
 
 
-def _again(drive: Grid, path: Path, settings: Tube) -> Path:
+def _again(drive: Grid, path: Path, settings: Tube, afresh: bool) -> Path:
     if "inflation" not in path.info or path.variance is None:
         return _solved(drive, settings)
     left_out = path.info.get("left_out", ())
     kept = _apart(drive.masked(np.isin(drive.t, [t for t, _ in left_out])), settings.step)
     rough = _coarse(drive, kept)
-    found = replace(path, azimuth=path.azimuth[kept], info={**path.info, "left_out": left_out})
+    fine = path
+    if afresh:
+        start = np.interp(rough.t, rough.t[rough.seen], path.azimuth[kept][rough.seen])
+        found = bounded.solve([rough], replace(settings.base, rounds=_AFRESH), azimuth=[start])[0]
+        if found.status is Status.STALLED or "half_widths" not in found.info:
+            return _solved(drive, settings)
+        names = ("east", "north", "azimuth", "speed")
+        own = {name: np.interp(drive.t, rough.t, getattr(found, name)) for name in names}
+        fine = replace(path, **{name: np.where(drive.seen, getattr(path, name), own[name]) for name in names})
+    else:
+        found = replace(path, azimuth=path.azimuth[kept], info={**path.info, "left_out": left_out})
     half = _DEVIATIONS * np.sqrt(path.variance[kept])
-    return _centred(drive, path, rough, kept, found, replace(settings, inflation=path.info["inflation"]), half)
+    return _centred(drive, fine, rough, kept, found, replace(settings, inflation=path.info["inflation"]), half)
 
 
 def inflation_of(drive: Grid, settings: Tube = Tube()) -> float:
@@ -145,7 +163,10 @@ def inflation_of(drive: Grid, settings: Tube = Tube()) -> float:
             cases.append((rough, found, np.column_stack((whole.east, whole.north))[kept], out))
     for inflation in INFLATIONS if cases else ():
         tried = replace(settings, inflation=inflation)
-        held = [_held(*_band(rough, found, tried), found, fixes)[out] for rough, found, fixes, out in cases]
+        held = [
+            _held(*_band(rough, found, tried, np.zeros(fixes.shape)), found, fixes)[out]
+            for rough, found, fixes, out in cases
+        ]
         if np.mean(np.concatenate(held)) >= SHARE:
             return inflation
     return INFLATIONS[-1] if cases else settings.inflation
@@ -232,6 +253,9 @@ def _band(
     step = np.array([half_widths.get(name, cap) for name, cap in zip(model.names.x, most, strict=True)])
     grows = np.array([name in half_widths for name in model.names.x])
     asked = _asked(rough, fixes=known is None)
+    told = np.isin(np.arange(len(rough)), asked)
+    if known is not None:
+        told |= ~_in_gaps(rough)
     both, axes = np.repeat(asked, 2), np.zeros((2 * asked.size, model.nx))
     axes[:, :2] = turn[asked].reshape(-1, 2)
     for _ in range(_FURTHER):
@@ -246,24 +270,35 @@ def _band(
         if not (np.isfinite(lo).all() and np.isfinite(hi).all()):
             break
         centre, half = 0.5 * (lo + hi), 0.5 * (hi - lo)
-        if known is not None:
-            place[asked], known[asked] = centre, half
-            return (place + origin, known), inflation
+        off, wide = np.zeros(place.shape), np.zeros(place.shape) if known is None else known.copy()
+        off[asked], wide[asked] = centre - place[asked], half
         # what is not asked for moves with the path of the chain, and is about as uncertain as its neighbours
-        off, half = (
-            np.column_stack([np.interp(rough.t, rough.t[asked], one[:, j]) for j in (0, 1)])
-            for one in (centre - place[asked], half)
+        off, wide = (
+            np.column_stack([np.interp(rough.t, rough.t[told], one[told, j]) for j in (0, 1)]) for one in (off, wide)
         )
-        return (place + off + origin, half), inflation
+        return (place + off + origin, wide), inflation
     return None, inflation
 
 
-def _asked(rough: Grid, *, fixes: bool) -> NDArray[np.intp]:
-    """Return the nodes that are asked for: those in gaps and around them, and, with `fixes`, some of the others."""
+def _in_gaps(rough: Grid) -> NDArray[np.bool_]:
+    """Return the nodes without a fix, and the fixes beside them."""
     lone = np.concatenate(([False], ~rough.seen, [False]))
-    wanted = lone[:-2] | lone[1:-1] | lone[2:]
+    return lone[:-2] | lone[1:-1] | lone[2:]
+
+
+def _asked(rough: Grid, *, fixes: bool) -> NDArray[np.intp]:
+    """Return the nodes that are asked for: some of those in gaps and all at their ends; with `fixes`, of the others."""
+    gaps = _in_gaps(rough)
+    edge = np.concatenate(([False], gaps, [False]))
+    inner = edge[:-2] & edge[1:-1] & edge[2:]
+    beside = np.concatenate(([False], inner, [False]))
+    # the first and last nodes of a gap, the ones next to them, and every so many between
+    wanted = gaps & ~(beside[:-2] & beside[1:-1] & beside[2:])
+    some = np.arange(len(rough)) % _EVERY == 0
+    wanted |= some & gaps
     if fixes:
-        wanted[::_EVERY] = wanted[-1] = True
+        wanted |= some
+        wanted[-1] = True
     return np.flatnonzero(wanted)
 
 
