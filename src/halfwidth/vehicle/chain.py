@@ -44,6 +44,7 @@ from halfwidth.result import Status
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pointing import azimuth_of, with_speed
+from halfwidth.vehicle.turning import Bridges, bridges, turning
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -63,9 +64,9 @@ LONGITUDINAL, LATERAL, SLIP, YAW, OFFSET, DRIFT, FIX = range(7)
 #: Rows of all drives that are solved side by side at most, but for a single longer drive.
 _BATCH = 20_000
 
-E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS, DRIFT_E, DRIFT_N = range(9)
+E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS, DRIFT_E, DRIFT_N, TURN = range(10)
 
-#: Number of states.
+#: Number of states; where a yaw rate is silent one more says how it deviates from what is expected.
 SIZE = 9
 
 
@@ -220,10 +221,12 @@ class _Rows:
     v: Floats
     w: Floats
     weight2: Floats  # (R, 4) squared weights of the first four groups
+    turn: tuple[Floats, Floats, Floats] | None  # (R,) each: one unit of the deviation, what is left of it, what comes in
     extra: Floats  # (R, 3) variance added to longitudinal, lateral and yaw where a sensor was silent
     gap: Mask  # (R,) whether the step lies in a gap between fixes
     y: Floats  # (R, 2) fixes, about the first of each drive
     seen: Mask  # (R, 2)
+    unknown: Mask  # (R, 3) where a sensor was silent
     origin: Floats  # (n, 2)
     far: Floats  # (n,) how far the first node may be from the first fix, m
 
@@ -252,6 +255,13 @@ def _rows(drives: Sequence[Grid]) -> _Rows:
     # a step of unknown speed may also slide: without this the lateral row would trust a wrong displacement
     lost_speed, lost_yaw = h * joined("speed_sd"), h * joined("yaw_rate_sd")
     extra = np.column_stack((lost_speed**2, (0.02 * lost_speed) ** 2, lost_yaw**2))
+    unknown = extra > 0
+    turn = None
+    if any(drive.has_yaw_rate and (drive.yaw_rate_sd > 0).any() for drive in drives):
+        parts = [_bridged(drive) for drive in drives]
+        w = np.concatenate([part.yaw_rate for part in parts])
+        turn = tuple(np.concatenate([getattr(part, name) for part in parts]) for name in ("size", "keep", "q"))
+        extra[:, 2] = np.where(turn[0] > 0, 0.0, extra[:, 2])
     seen = np.concatenate([drive.seen for drive in drives])
     origin, far = np.zeros((len(drives), 2)), np.zeros(len(drives))
     for i, drive in enumerate(drives):
@@ -261,7 +271,16 @@ def _rows(drives: Sequence[Grid]) -> _Rows:
     y = np.column_stack((joined("east"), joined("north"))) - origin[index]
     y[~seen] = 0.0
     gap = np.concatenate([in_gap(drive) for drive in drives])
-    return _Rows(offsets, index, first, h, v, w, weight2, extra, gap, y, np.column_stack((seen, seen)), origin, far)
+    return _Rows(offsets, index, first, h, v, w, weight2, turn, extra, gap, y, np.column_stack((seen, seen)), unknown, origin, far)
+
+
+def _bridged(drive: Grid) -> Bridges:
+    """Return the yaw rates of a drive with those that were silent as they are expected."""
+    h, silent = drive.h, drive.yaw_rate_sd > 0
+    law = turning(h, drive.speed, drive.yaw_rate, ~silent & (drive.speed_sd == 0))
+    if not drive.has_yaw_rate:
+        silent = np.zeros_like(silent)
+    return bridges(h, drive.speed, drive.yaw_rate, silent, law)
 
 
 def in_gap(drive: Grid) -> Mask:
@@ -292,20 +311,25 @@ def _linearised(rows: _Rows, psi: Floats) -> _Line:
     middle[1:] = 0.5 * (psi[1:] + psi[:-1])
     middle[rows.first] = psi[rows.first]
     S, C, vh = np.sin(middle), np.cos(middle), v * h
-    A = np.zeros((h.size, SIZE, SIZE))
+    size = SIZE + (rows.turn is not None)
+    A = np.zeros((h.size, size, size))
     A[:, range(SIZE), range(SIZE)] = 1.0
     A[:, E, AZIMUTH], A[:, E, SCALE], A[:, E, BIAS] = C * vh, S * vh, 0.5 * C * vh * h
     A[:, N, AZIMUTH], A[:, N, SCALE], A[:, N, BIAS] = -S * vh, C * vh, -0.5 * S * vh * h
     A[:, AZIMUTH, BIAS] = h
+    if rows.turn is not None:
+        unit, keep, _ = rows.turn
+        A[:, [E, N, AZIMUTH], TURN] = -unit[:, None] * A[:, [E, N, AZIMUTH], BIAS]
+        A[:, TURN, TURN] = keep
     aside = vh * (-0.5 * h * w - middle)
-    b = np.zeros((h.size, SIZE))
+    b = np.zeros((h.size, size))
     b[:, E], b[:, N], b[:, AZIMUTH] = C * aside, -S * aside, -h * w
-    A[rows.first] = np.eye(SIZE)
+    A[rows.first] = np.eye(size)
     b[rows.first] = 0.0
     return _Line(A, b, S, C, 0.5 * vh)
 
 
-_OUT = np.zeros((2, SIZE))
+_OUT = np.zeros((2, SIZE + 1))
 _OUT[0, [E, OFFSET_E]] = _OUT[1, [N, OFFSET_N]] = 1.0
 
 
@@ -335,7 +359,8 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Cha
     along, aside, yaw = _variances(rows, own)
     # the noise of the rotated residuals, in the axes of the state
     across = aside + line.half**2 * yaw
-    Q = np.zeros((h.size, SIZE, SIZE))
+    size = A.shape[1]
+    Q = np.zeros((h.size, size, size))
     S, C = line.S, line.C
     Q[:, E, E] = S * S * along + C * C * across
     Q[:, N, N] = C * C * along + S * S * across
@@ -347,9 +372,11 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Cha
     Q[:, DRIFT_E, DRIFT_E] = Q[:, DRIFT_N, DRIFT_N] = own[:, DRIFT] * h
     Q[:, SCALE, SCALE] = settings.scale_walk**2 * h
     Q[:, BIAS, BIAS] = settings.bias_walk**2 * h
+    if rows.turn is not None:
+        Q[:, TURN, TURN] = rows.turn[2]
     Q[rows.first] = 0.0
     start = rows.offsets[:-1]
-    x0, P0 = np.zeros((n, SIZE)), np.zeros((n, SIZE, SIZE))
+    x0, P0 = np.zeros((n, size)), np.zeros((n, size, size))
     x0[:, SCALE] = 1.0
     x0[:, AZIMUTH] = np.arctan2(S[start], C[start])
     offset, drift = _stationary(s2, settings)
@@ -358,6 +385,8 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Cha
     P0[:, OFFSET_E, OFFSET_E] = P0[:, OFFSET_N, OFFSET_N] = offset
     P0[:, DRIFT_E, DRIFT_E] = P0[:, DRIFT_N, DRIFT_N] = drift
     P0[:, SCALE, SCALE], P0[:, BIAS, BIAS] = settings.scale_sd**2, settings.bias_sd**2
+    if rows.turn is not None:
+        P0[:, TURN, TURN] = 1.0
     # one drive at a time: the sums of the core are kept for each row of Q, so they cannot be shared between drives
     parts = []
     for i in range(n):
@@ -367,7 +396,7 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Cha
                 "smooth",
                 A[part],
                 None,
-                _OUT,
+                _OUT[:, :size],
                 Q[part],
                 s2[i, FIX] * np.eye(2),
                 rows.y[part],
@@ -444,7 +473,7 @@ def _learnt(rows: _Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Flo
     for g, sensor in ((LONGITUDINAL, 0), (LATERAL, 1), (SLIP, 1), (YAW, 2), (OFFSET, -1), (DRIFT, -1)):
         keep = ~rows.first & np.isfinite(squares[:, g])
         if sensor >= 0:
-            keep &= rows.extra[:, sensor] == 0
+            keep &= ~rows.unknown[:, sensor]
         of = rows.drive[keep]
         counted = np.ones(of.size)
         value = squares[keep, g]
@@ -462,7 +491,7 @@ def _learnt(rows: _Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Flo
 
 def _fit(rows: _Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain) -> Fit:
     part = slice(int(rows.offsets[i]), int(rows.offsets[i + 1]))
-    z, P = out.x[part].copy(), out.P[part]
+    z, P = out.x[part, :SIZE].copy(), out.P[part, :SIZE, :SIZE]
     z[:, [E, N]] += rows.origin[i]
     east, north = z[:, E] + z[:, OFFSET_E], z[:, N] + z[:, OFFSET_N]
     variance = np.column_stack([P[:, a, a] + 2 * P[:, a, o] + P[:, o, o] for a, o in ((E, OFFSET_E), (N, OFFSET_N))])
