@@ -13,10 +13,13 @@ as what is left of it after a step of h seconds and the variance that comes in. 
 one more state, and the fixes, and the heading on both sides, say what it was.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
+
+from halfwidth.vehicle.grid import Grid
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -161,6 +164,27 @@ def bridges(h: Floats, speed: Floats, yaw_rate: Floats, silent: Mask, law: Turni
             mean = u0 * np.exp(-middle / tau) + u1 * np.exp(-(length - middle) / tau)
         rate[steps], keep[steps], q[steps] = size[steps] * mean, stays, comes
     return Bridges(rate, size, keep, q)
+
+
+def bridged(drive: Grid) -> Bridges:
+    """Return the yaw rates of a drive, with those that were silent bridged by the law of the others.
+
+    Parameters
+    ----------
+    drive : Grid
+
+    Returns
+    -------
+    Bridges
+    """
+    h, silent = drive.h, (drive.yaw_rate_sd > 0) & drive.has_yaw_rate
+    law = turning(h, drive.speed, drive.yaw_rate, (drive.yaw_rate_sd == 0) & (drive.speed_sd == 0))
+    return bridges(h, drive.speed, drive.yaw_rate, silent, law)
+
+
+def joined(parts: Sequence[Bridges]) -> Bridges:
+    """Put the bridges of drives one below the other."""
+    return Bridges(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Bridges)))
 
 
 def _unit(rate: float, size: Floats) -> float:
