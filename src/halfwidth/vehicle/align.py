@@ -21,9 +21,9 @@ from halfwidth.vehicle import evidence, reckoning, rolling
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import STREAMS, Log
-from halfwidth.vehicle.repair import contradicted_yaw, matched_factor
 from halfwidth.vehicle.rough import WIDEST, Rough
 from halfwidth.vehicle.sensors import AS_LOGGED, STREAM, Calibration, Offset
+from halfwidth.vehicle.units import contradicted_yaw, matched_factor
 
 Floats = NDArray[np.float64]
 
