@@ -21,7 +21,7 @@ from halfwidth.vehicle import evidence, reckoning, rolling
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import STREAMS, Log
-from halfwidth.vehicle.rough import WIDEST, Rough
+from halfwidth.vehicle.rough import WIDEST, Rough, cut_of
 from halfwidth.vehicle.sensors import AS_LOGGED, STREAM, Calibration, Offset
 from halfwidth.vehicle.units import contradicted_yaw, matched_factor
 
@@ -86,7 +86,7 @@ def calibrated(log: Log, *, clock_offset: float | None = None) -> Calibration:
     start = {name: Offset(seconds, 0.0, True) for name, seconds in first.items()}
     known = replace(known, still=standstills(log, replace(known, offsets=start)))
     grid = sampled(log)
-    cut = None if given.given else rough.cut()
+    cut = None if given.given else cut_of(log, known, rough)
     parts = _parts(grid, cut)
     plain = replace(known, offsets={}, still=AS_LOGGED.still)
     streams: reckoning.Streams = {name: plain.stream(log, name) for name in _SENSORS}

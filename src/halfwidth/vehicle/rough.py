@@ -26,6 +26,9 @@ FEWEST = 20
 #: A step of the clocks has so much of the drive on either side, and is looked for at times so far apart, s.
 STEP_SIDE, STEP_APART = 30.0, 1.0
 
+#: Windows of so many seconds are asked for a step.
+SPANS = (1.0, 2.0, 4.0)
+
 #: How long after each other the courses lie that are compared with the yaw rate, s.
 _TURN = 5.0
 
@@ -40,14 +43,14 @@ class Rough:
     span: dict[str, float]  # of each window, s
 
     @classmethod
-    def of(cls, log: Log, known: Calibration) -> "Rough":
-        """Try every offset on the windows of a log whose units are known, its clocks not."""
+    def of(cls, log: Log, known: Calibration, least: float = 1.0) -> "Rough":
+        """Try every offset on the windows, of so many seconds at least, of a log whose units are known, its clocks not."""
         t_fix = log.t[log.fixed]
         usual = float(np.median(np.diff(t_fix)))
         lags = np.arange(-WIDEST, WIDEST + 1e-9, max(0.1, min(usual, 1.0) / 4))
         when, misfit = {}, {}
         plain = replace(known, offsets={})
-        span = max(1.0, usual)
+        span = max(least, usual)
         spans = {"speed": span, "yaw_rate": _TURN}
         chord = evidence.windows(log, span)
         middle, took = 0.5 * (chord.start + chord.stop), chord.stop - chord.start
@@ -90,8 +93,8 @@ class Rough:
         none = float(np.interp(0.0, self.lags, cost))
         return float(self.lags[k]) if cost[k] < 0.9 * none else 0.0
 
-    def cut(self) -> float | None:
-        """Return when the clocks step, s; None where one offset for the whole drive explains it about as well.
+    def cut(self) -> tuple[float, float] | None:
+        """Return when the clocks step, s, and by how much two offsets explain the drive better than one; None if not.
 
         Misfits are taken for Laplace's, as their absolute values are what is minimised, and windows that overlap count
         as one. Both streams are asked together: they mostly come by the same logger.
@@ -109,13 +112,14 @@ class Rough:
             before = loglik[np.searchsorted(when, cuts)]
             gain += before.max(axis=1) + (loglik[-1] - before).max(axis=1) - loglik[-1].max()
         # so many steps were tried that one of them gains this much by chance
-        if gain.max() <= np.log(cuts.size * self.lags.size):
+        more = float(gain.max() - np.log(cuts.size * self.lags.size * len(SPANS)))
+        if more <= 0:
             return None
         # where nothing tells when, as in a gap, the middle is never far off
         alike = np.flatnonzero(gain > gain.max() - 0.5)
         same = np.cumsum(np.diff(alike, prepend=alike[0]) > 1)
         best = same[np.searchsorted(alike, np.argmax(gain))]
-        return float(cuts[alike[same == best]].mean())
+        return float(cuts[alike[same == best]].mean()), more
 
     def _likely(self, name: str) -> tuple[Floats, Floats]:
         """Return the times (n,) of the windows of a stream and, for each offset, the log-likelihood up to each."""
@@ -130,6 +134,16 @@ class Rough:
         """Return the times and misfits of the windows in which every offset can be judged."""
         whole = np.isfinite(self.misfit[name]).all(axis=1)
         return self.when[name][whole], _capped(self.misfit[name])
+
+
+def cut_of(log: Log, known: Calibration, rough: Rough) -> float | None:
+    """Return when the clocks step, s, by the windows that tell it best; None where one offset explains the drive.
+
+    A speed has changed by more in a longer window, in which the error of the fixes matters less; but there are fewer.
+    """
+    longer = (Rough.of(log, known, span) for span in SPANS[1:])
+    found = [one for one in (rough.cut(), *(look.cut() for look in longer)) if one is not None]
+    return max(found, key=lambda one: one[1])[0] if found else None
 
 
 def _capped(rows: Floats) -> Floats:
