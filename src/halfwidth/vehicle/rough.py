@@ -44,7 +44,7 @@ class Rough:
 
     @classmethod
     def of(cls, log: Log, known: Calibration, least: float = 1.0) -> "Rough":
-        """Try every offset on the windows, of so many seconds at least, of a log whose units are known, its clocks not."""
+        """Try every offset on the windows, of some seconds, of a log whose units are known, its clocks not."""
         t_fix = log.t[log.fixed]
         usual = float(np.median(np.diff(t_fix)))
         lags = np.arange(-WIDEST, WIDEST + 1e-9, max(0.1, min(usual, 1.0) / 4))
@@ -99,27 +99,29 @@ class Rough:
         Misfits are taken for Laplace's, as their absolute values are what is minimised, and windows that overlap count
         as one. Both streams are asked together: they mostly come by the same logger.
         """
+        cuts, gain = self._gains()
+        # so many steps were tried that one of them gains this much by chance
+        more = float(gain.max(initial=0.0) - np.log(max(cuts.size, 1) * self.lags.size * len(SPANS)))
+        return (_middle(cuts, gain), more) if more > 0 else None
+
+    def likeliest(self) -> float | None:
+        """Return when the clocks step if they do, s."""
+        cuts, gain = self._gains()
+        return _middle(cuts, gain) if cuts.size else None
+
+    def _gains(self) -> tuple[Floats, Floats]:
+        """Return times and by how much offsets before and after each explain the drive better than one does."""
         found = [self._likely(name) for name in self.misfit]
         found = [(when, loglik) for when, loglik in found if len(when) >= FEWEST]
         if not found:
-            return None
+            return np.empty(0), np.empty(0)
         first, last = min(when[0] for when, _ in found), max(when[-1] for when, _ in found)
         cuts = np.arange(first + STEP_SIDE, last - STEP_SIDE, STEP_APART)
-        if cuts.size == 0:
-            return None
         gain = np.zeros(cuts.size)
         for when, loglik in found:
             before = loglik[np.searchsorted(when, cuts)]
             gain += before.max(axis=1) + (loglik[-1] - before).max(axis=1) - loglik[-1].max()
-        # so many steps were tried that one of them gains this much by chance
-        more = float(gain.max() - np.log(cuts.size * self.lags.size * len(SPANS)))
-        if more <= 0:
-            return None
-        # where nothing tells when, as in a gap, the middle is never far off
-        alike = np.flatnonzero(gain > gain.max() - 0.5)
-        same = np.cumsum(np.diff(alike, prepend=alike[0]) > 1)
-        best = same[np.searchsorted(alike, np.argmax(gain))]
-        return float(cuts[alike[same == best]].mean()), more
+        return cuts, gain
 
     def _likely(self, name: str) -> tuple[Floats, Floats]:
         """Return the times (n,) of the windows of a stream and, for each offset, the log-likelihood up to each."""
@@ -134,6 +136,14 @@ class Rough:
         """Return the times and misfits of the windows in which every offset can be judged."""
         whole = np.isfinite(self.misfit[name]).all(axis=1)
         return self.when[name][whole], _capped(self.misfit[name])
+
+
+def _middle(cuts: Floats, gain: Floats) -> float:
+    """Return the middle of the times about the best one that are as good: where nothing tells, it is never far off."""
+    alike = np.flatnonzero(gain > gain.max() - 0.5)
+    same = np.cumsum(np.diff(alike, prepend=alike[0]) > 1)
+    best = same[np.searchsorted(alike, np.argmax(gain))]
+    return float(cuts[alike[same == best]].mean())
 
 
 def cut_of(log: Log, known: Calibration, rough: Rough) -> float | None:
