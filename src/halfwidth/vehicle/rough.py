@@ -93,16 +93,16 @@ class Rough:
         none = float(np.interp(0.0, self.lags, cost))
         return float(self.lags[k]) if cost[k] < 0.9 * none else 0.0
 
-    def cut(self) -> tuple[float, float] | None:
-        """Return when the clocks step, s, and by how much two offsets explain the drive better than one; None if not.
+    def cut(self) -> float | None:
+        """Return when the clocks step, s; None where one offset for the whole drive explains it about as well.
 
         Misfits are taken for Laplace's, as their absolute values are what is minimised, and windows that overlap count
         as one. Both streams are asked together: they mostly come by the same logger.
         """
         cuts, gain = self._gains()
         # so many steps were tried that one of them gains this much by chance
-        more = float(gain.max(initial=0.0) - np.log(max(cuts.size, 1) * self.lags.size * len(SPANS)))
-        return (_middle(cuts, gain), more) if more > 0 else None
+        chance = float(np.log(max(cuts.size, 1) * self.lags.size * len(SPANS)))
+        return _middle(cuts, gain) if gain.max(initial=0.0) > chance else None
 
     def likeliest(self) -> float | None:
         """Return when the clocks step if they do, s."""
@@ -147,13 +147,15 @@ def _middle(cuts: Floats, gain: Floats) -> float:
 
 
 def cut_of(log: Log, known: Calibration, rough: Rough) -> float | None:
-    """Return when the clocks step, s, by the windows that tell it best; None where one offset explains the drive.
+    """Return when the clocks step, s, by the shortest windows that tell it; None where one offset explains the drive.
 
-    A speed has changed by more in a longer window, in which the error of the fixes matters less; but there are fewer.
+    A speed has changed by more in a longer window, in which the error of the fixes matters less; but there are fewer,
+    and they say less about when.
     """
-    longer = (Rough.of(log, known, span) for span in SPANS[1:])
-    found = [one for one in (rough.cut(), *(look.cut() for look in longer)) if one is not None]
-    return max(found, key=lambda one: one[1])[0] if found else None
+    when = rough.cut()
+    for span in SPANS[1:]:
+        when = Rough.of(log, known, span).cut() if when is None else when
+    return when
 
 
 def _capped(rows: Floats) -> Floats:
