@@ -1,14 +1,14 @@
 """Accuracy and coverage of `Posterior` on the system of Pavelková and Kárný (2013), sec. 6.
 
-    python benchmarks/posterior.py [table] [windows] [streams] [known] [variances] [priors] [ensemble] [outliers] [robust]
-                                   [calibration] [pictures]
+    python benchmarks/posterior.py [table] [windows] [streams] [known] [nodes] [variances] [priors] [ensemble] [outliers]
+                                   [robust] [calibration] [pictures]
 
 Paths stay inside the boxes by rejection of whole paths. The Kalman filter is told the true covariances and is clipped to
 the boxes. `windows`: each window of `Delta` + 1 rows on its own, told no half-width and nothing of the past, of which the
 Kalman filter sees 15 rows. `streams`: long paths by `Window(Posterior())`, which carries what it has learned, against the
 Kalman filter on the same rows, after a burn-in of 200 rows; whole paths of that length cannot be rejected, so one is the
 genealogy of a particle among 5,000 that are resampled from those inside at every row. `table` is both; without arguments
-it is printed. `outliers` redraws disturbances that would leave the boxes, which is another law. `calibration` draws
+it is printed. `nodes`: what fewer nodes leave of the integral over half-widths. `outliers` redraws disturbances that would leave the boxes, which is another law. `calibration` draws
 half-widths from the prior that is used, without bounds. `WINDOWS=500` sets the number of windows; streams have twelve times
 as many. `PICTURES=folder` writes the diagrams of `calibration` and `pictures` there.
 """
@@ -254,6 +254,22 @@ def against_draws():
         f"{ratio.min():.3f} to {ratio.max():.3f}; share of draws inside intervals of 50 80 90 95 %: "
         + " ".join(f"{100 * v:.1f}" for v in np.mean(held, axis=0))
     )
+
+
+def fewer_nodes():
+    """Compare what some nodes give with what 1024 give."""
+    model = system(*(hw.Uniform.unknown(at_most=1.0),) * 2)
+    parts = [part for _, _, part in windows(25, min(WINDOWS, 50), 7)]
+    many = [hw.estimate(model, part, hw.Posterior(nodes=1024)) for part in parts]
+    print(f"{len(parts)} windows of Delta 25, five unknown half-widths, against 1024 nodes")
+    for count in (16, 32, 64, 128):
+        some = [hw.estimate(model, part, hw.Posterior(nodes=count)) for part in parts]
+        off = np.mean([np.abs(a.x - b.x) / b.spread.sd for a, b in zip(some, many, strict=True)])
+        ratio = np.array([a.spread.sd / b.spread.sd for a, b in zip(some, many, strict=True)])
+        print(
+            f"  {count:4d} nodes: means off by {off:.3f} sd on average; sd ratio {ratio.mean():.3f}, "
+            f"root mean square {np.sqrt(np.mean((ratio - 1) ** 2)):.3f} from 1"
+        )
 
 
 def table():
@@ -606,7 +622,7 @@ def _save(axes, name):
 def main():
     """Run what is asked for."""
     studies = {
-        "table": table, "windows": windows_alone, "streams": streams, "known": against_draws, "priors": priors, "ensemble": ensemble, "outliers": outliers, "robust": robust,
+        "table": table, "windows": windows_alone, "streams": streams, "known": against_draws, "nodes": fewer_nodes, "priors": priors, "ensemble": ensemble, "outliers": outliers, "robust": robust,
         "calibration": calibration, "pictures": pictures, "variances": variances,
     }  # fmt: skip
     for name in sys.argv[1:] or ["table"]:

@@ -75,10 +75,10 @@ def test_what_a_window_tells_is_the_slope_of_its_evidence():
 def test_knowing_half_of_the_rows_is_as_good_as_having_them():
     _, record = drawn(240, 5)
     first, second = (hw.Record(record.t[k], record.y[k]) for k in (slice(0, 120), slice(120, 240)))
-    model = system(UNKNOWN, UNKNOWN)
-    known = hw.Posterior().answer(model, first).told
-    answer = hw.Posterior().answer(model, second, known=known)
-    both, alone = (hw.estimate(model, r, hw.Posterior()).info["half_widths"] for r in (record, second))
+    model, fine = system(UNKNOWN, UNKNOWN), hw.Posterior(nodes=128)
+    known = fine.answer(model, first).told
+    answer = fine.answer(model, second, known=known)
+    both, alone = (hw.estimate(model, r, fine).info["half_widths"] for r in (record, second))
     carried = answer.estimate.info["half_widths"]
     assert np.all(carried["sd"] < alone["sd"] * 0.95)
     np.testing.assert_allclose(carried["sd"], both["sd"], rtol=0.25)

@@ -78,7 +78,7 @@ def test_half_widths_are_learned_without_bias():
 
 def test_intervals_cover_what_they_say():
     inside = []
-    for seed in range(40):
+    for seed in range(100):
         truth, record = drawn(26, 100 + seed)
         est = hw.estimate(paper(UNKNOWN, UNKNOWN), record, hw.Posterior())
         inside.append(

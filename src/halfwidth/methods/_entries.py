@@ -39,7 +39,7 @@ def with_entries(method: "Posterior", model: Linear, record: Record) -> Estimate
     p = len(theta)
     z = nodes(p, _NODES)
     log_proposal = -0.5 * (z**2).sum(axis=1) - 0.5 * p * math.log(2 * math.pi)
-    inner = replace(method, nodes=max(1, method.nodes // 4))
+    inner = replace(method, nodes=max(1, method.nodes // 2))
     found: list[tuple[float, Array, Estimate]] = []
     for k in range(len(z)):
         at = theta + L @ z[k]

@@ -95,7 +95,9 @@ class Posterior:
         a half-width is the power alone, without `told`.
     nodes : int
         Most points over which unknown half-widths are integrated: no more are taken than what is left in doubt asks
-        for, and no fewer than six and two for each unknown. 1 takes their mode as if it were the truth.
+        for, and no fewer than six and two for each unknown. With five half-widths of 26 rows 32 leave the means .05
+        standard deviations off on average, 128 a tenth of that for twice the time. 1 takes their mode as if it were the
+        truth.
     outliers : float or bool
         Share of outputs that are outliers, whose noise is ten half-widths wide; True learns it. Each output noise needs
         a bounded part.
@@ -136,7 +138,7 @@ class Posterior:
     """
 
     method: Literal["ep", "sample"] = "ep"
-    nodes: int = 128
+    nodes: int = 32
     outliers: float | bool = False
     rounds: int = 20
     iterations: int = 200
