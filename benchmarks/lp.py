@@ -19,7 +19,7 @@ from halfwidth.methods.window import window_chain
 from halfwidth.reproduce import paper003
 from halfwidth.result import Status
 from halfwidth.solvers.banded import Chain, solve
-from halfwidth.solvers.lp import PIQP, highs
+from halfwidth.solvers.stock import PIQP, highs
 
 H = 0.1
 

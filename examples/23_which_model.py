@@ -45,7 +45,7 @@ def main():
         x = 0.95 * x + rng.normal(0, 0.1)
         y.append(x + rng.uniform(-half, half))
     changing = hw.Record(np.arange(150.0), y)
-    method = hw.Posterior(nodes=32)
+    method = hw.Posterior()
     choice = hw.choose_memory(walk(bell, box), changing, method, memories=(10, 20, 60), recall=0.0)
     print(choice)
 

@@ -11,7 +11,7 @@ def main():
     truth, record = hw.simulate(true, T=200, seed=4)
     unknown = hw.Uniform.unknown(at_most=5.0)
     asked = hw.Linear(A, None, C, unknown, unknown, hw.Box(-1, 1))
-    inner = hw.Posterior(nodes=32)
+    inner = hw.Posterior()
 
     # Ten rows tell little of four half-widths. With `recall` a window also knows what the rows that have left it told.
     late = slice(50, None)

@@ -44,7 +44,7 @@ def main():
     print(hw.estimate(hw.Linear(A, None, C, unknown, unknown, x0), rounded).R.round(2))
 
     # On line, variances are carried from window to window as half-widths are.
-    live = hw.estimate(mixed, rounded, hw.Window(hw.Posterior(nodes=32), memory=15))
+    live = hw.estimate(mixed, rounded, hw.Window(hw.Posterior(), memory=15))
     print("last window of 16 rows: Q =", live.Q.round(2), "R =", live.R.round(2))
 
 

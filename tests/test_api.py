@@ -48,3 +48,11 @@ def test_type_checkers_see_every_public_name():
         source = pathlib.Path(package.__file__).read_text()
         for name in package.__all__:
             assert name == "__version__" or f"import {name} as {name}\n" in source, name
+
+
+def test_the_reference_has_every_public_name():
+    reference = (pathlib.Path(__file__).parents[1] / "docs" / "reference.md").read_text().split()
+    for package in (hw, hw.vehicle):
+        for name in package.__all__:
+            module = getattr(getattr(package, name), "__module__", None)
+            assert module is None or {module, f"{module}.{name}"} & set(reference), f"{module}.{name}"

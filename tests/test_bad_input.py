@@ -9,6 +9,7 @@ I2 = np.eye(2)
 C = [[1.0, 0.0]]
 G, S = hw.Gaussian(0.1), hw.Gaussian(1.0)
 X0 = hw.Normal([0.0, 0.0], 1.0)
+THREE = hw.Record([0.0, 1.0, 2.0], [1.0, None, 3.0])
 
 
 def linear(**changes):
@@ -134,6 +135,8 @@ CASES = {
     "u of other length": (lambda: hw.Record([0.0], [1.0], one(1)), hw.BadShape, "`u`"),
     "without a span": (lambda: hw.Record([0.0], [1.0]).without(2.0, 1.0), hw.BadValue, "t0 <= t1"),
     "extended by nothing": (lambda: hw.Record([0.0], [1.0]).extended(0), hw.BadValue, "steps"),
+    "extended by a step back": (lambda: hw.Record([0.0], [1.0]).extended(1, dt=-1.0), hw.BadValue, "`dt` is -1.0"),
+    "extended by a step of NaN": (lambda: hw.Record([0.0], [1.0]).extended(1, dt=np.nan), hw.BadValue, "`dt` is nan"),
     "extended without inputs": (lambda: hw.Record([0.0], [1.0], [1.0]).extended(1), hw.BadRecord, "u="),
     # the front door
     "model is a matrix": (lambda: hw.estimate(I2, hw.Record([0.0], [1.0])), hw.BadValue, "Linear(...)"),
@@ -186,6 +189,15 @@ CASES = {
     ),
     "box without ends as Gaussian": (lambda: linear(x0=None).as_gaussian(), hw.Refused, "x0=Normal"),
     "simulate without a length": (lambda: hw.simulate(linear()), hw.BadValue, "T=100"),
+    "simulate with a number for inputs": (lambda: hw.simulate(linear(), 100), hw.BadShape, "simulate(model, T=100)"),
+    "simulate at a number": (lambda: hw.simulate(linear(), t=3.0), hw.BadShape, "`t` is 3, a row for each time"),
+    "a density that is a noise": (lambda: hw.from_continuous(I2, None, C, G, S, X0), hw.BadValue, "spectral density"),
+    "no memory to choose": (
+        lambda: hw.choose_memory(linear(), THREE, memories=()),
+        hw.BadValue,
+        "memories=(5, 15, 50)",
+    ),
+    "a memory for a model that is refused": (lambda: hw.choose_memory(linear(), THREE), hw.Refused, "uniform noise"),
     "simulate unknown entries": (lambda: hw.simulate(linear(A=[[np.nan, 0], [0, 1]]), T=3), hw.BadValue, "unknown"),
     "simulate unknown half-widths": (lambda: hw.simulate(linear(w=hw.Uniform.unknown()), T=3), hw.Refused, "known"),
     "simulate from a box without ends": (lambda: hw.simulate(linear(x0=None), T=3), hw.BadValue, "finite Box"),
@@ -199,6 +211,24 @@ CASES = {
         lambda: hw.score(hw.estimate(linear(), hw.Record([0.0], [1.0])), np.ones((1, 2)), during=(5, 6)),
         hw.BadValue,
         "no row",
+    ),
+    "score during one time": (
+        lambda: hw.score(hw.estimate(linear(), THREE), np.ones((3, 2)), during=5.0),
+        hw.BadValue,
+        "two times in seconds",
+    ),
+    "score of no such state": (
+        lambda: hw.score(hw.estimate(linear(), THREE), np.ones((3, 2)), states=[2]),
+        hw.BadValue,
+        "from 0 to 1",
+    ),
+    "kappa below 0": (lambda: hw.ensemble_interval(hw.estimate(linear(), THREE), -1.0), hw.BadValue, "kappa=1.0"),
+    "models without names": (lambda: hw.compare([linear()], THREE), hw.BadValue, "models by name"),
+    "a number for a model": (lambda: hw.compare({"a": linear(), "b": 3}, THREE), hw.BadValue, "`models` has 3 under"),
+    "half-widths unknown on a stream": (
+        lambda: hw.stream(linear(w=hw.Uniform.unknown(), e=hw.Uniform.unknown(), x0=None)),
+        hw.Refused,
+        "hint: stream(model, Window(Posterior(), memory=25))",
     ),
     "outputs that are not there": (
         lambda: hw.Record([0.0, 1.0], [1.0, 2.0]).without(0, 1, outputs=[3]),

@@ -184,9 +184,19 @@ def test_estimate_says_what_is_wrong(text, code, words, files, tmp_path, capsys)
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("text", ["a,b,c\n1,2,3\n4,5,6\n", "lat\n1\n", "# nothing\n"])
+def test_a_table_without_the_columns_of_the_model_is_not_taken_for_a_log(text, files, tmp_path, capsys):
+    (tmp_path / "other.csv").write_text(text)
+    assert cli.run(["estimate", files[0], str(tmp_path / "other.csv")]) == 3
+    err = capsys.readouterr().err
+    assert "has no column 'when'; found: " in err
+    assert "hint: `time`, `outputs` and `inputs` of the model name the columns" in err
+    assert "latitude" not in err
+
+
 def test_a_model_that_is_not_there(files, capsys):
     assert cli.run(["estimate", "/no/such.toml", files[1]]) == 3
-    assert "cannot be read: no such file" in capsys.readouterr().err
+    assert "cannot be read: no such file or directory\nhint: check the spelling" in capsys.readouterr().err
 
 
 def test_dates_become_seconds(files, table, tmp_path):

@@ -102,11 +102,11 @@ def test_the_top_has_no_slope(structure, method):
 
 
 def test_gradient_by_fishers_identity_is_the_numerical_one():
-    from halfwidth.learn import _Map, _Problem
+    from halfwidth.methods._likelihood import Problem, _Map
 
     record = gappy(truth(), 100, 1, entries=True)
     start = guess(truth())
-    problem = _Problem(start, start, [record], ("Q", "R"), {}, {"Q": "full", "R": "full"})
+    problem = Problem(start, start, [record], ("Q", "R"), {}, {"Q": "full", "R": "full"})
     map_q = _Map("full", hw.Gaussian(Q).cov())
     p = map_q.start() + 0.1
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from halfwidth.trace import Tape, Untraceable, compiled, trace
+from halfwidth.tape import Tape, Untraceable
+from halfwidth.trace import compiled, trace
 
 A = np.array([[1.0, 0.0, -2.0], [0.5, 0.3, 0.0], [0.0, 1.0, 1.0]])
 PI = np.pi

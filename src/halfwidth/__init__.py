@@ -51,7 +51,7 @@ _HOME: dict[str, str] = {
     "compare": "methods.choose",
     "Comparison": "methods.choose",
     "learn": "learn",
-    "Learned": "learn",
+    "Learned": "methods._likelihood",
     "HalfwidthError": "errors",
     "BadShape": "errors",
     "BadValue": "errors",
@@ -87,11 +87,11 @@ if TYPE_CHECKING:
     from halfwidth.errors import Unsolved as Unsolved
     from halfwidth.estimate import estimate as estimate
     from halfwidth.forecast import forecast as forecast
-    from halfwidth.learn import Learned as Learned
     from halfwidth.learn import learn as learn
     from halfwidth.loss import Bernoulli as Bernoulli
     from halfwidth.loss import Markov as Markov
     from halfwidth.methods._functional import Bound as Bound
+    from halfwidth.methods._likelihood import Learned as Learned
     from halfwidth.methods._protocol import Estimator as Estimator
     from halfwidth.methods._protocol import Recursive as Recursive
     from halfwidth.methods.choose import Comparison as Comparison

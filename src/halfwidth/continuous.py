@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from halfwidth.array import Array, covariance, real
-from halfwidth.errors import BadShape
+from halfwidth.errors import BadShape, BadValue
 from halfwidth.model import Linear, Prior
 from halfwidth.noise import Gaussian, Noise
 
@@ -53,6 +53,8 @@ def from_continuous(
     array([[1. , 0.5],
            [0. , 1. ]])
     """
+    if isinstance(Q, Gaussian):
+        raise BadValue(f"`Q` is {Q!r}, the numbers of a spectral density were expected", hint="Q=[[0, 0], [0, 2.0]]")
     a, q = real(A, "A"), real(Q, "Q")
     if a.ndim != 2 or a.shape[0] != a.shape[1]:
         raise BadShape(f"`A` has shape {a.shape}, a square matrix (nx, nx) was expected")

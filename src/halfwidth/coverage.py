@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from halfwidth.array import Array, real
-from halfwidth.errors import BadShape, BadValue, Missing, Refused
+from halfwidth.errors import BadShape, BadValue, Refused
 from halfwidth.result import Estimate
+from halfwidth.show import pyplot
 
 #: Probability of the bands.
 _BAND = 0.99
@@ -62,6 +63,13 @@ class Coverage:
 
     def plot(self, ax: Any = None, *, label: str | None = None) -> Any:
         """Draw found against asked with the band, and return the axes; several go into one `ax`.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            New ones if absent.
+        label : str, optional
+            In the legend; the method if absent.
 
         Raises
         ------
@@ -117,7 +125,17 @@ class Ranks:
     def of(cls, values: ArrayLike, bins: int = 20) -> "Ranks":
         """Return the histogram of ranks scaled to 0 .. 1, (n,) independent ones or (n, k) with k of each trial.
 
-        Such as the share of the draws of a posterior that lie below the truth.
+        Parameters
+        ----------
+        values : (n,) or (n, k) array_like
+            Such as the share of the draws of a posterior that lie below the truth.
+        bins : int
+            Bars of the histogram, at least 2.
+
+        Raises
+        ------
+        BadValue
+            If there are no values, one is not in 0 .. 1, or bins are too few.
         """
         given = real(values, "values")
         table = given.reshape(len(given), -1)
@@ -149,6 +167,13 @@ class Ranks:
 
     def plot(self, ax: Any = None, *, label: str | None = None) -> Any:
         """Draw the histogram with its band and return the axes.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            New ones if absent.
+        label : str, optional
+            In the legend.
 
         Raises
         ------
@@ -195,8 +220,8 @@ def coverage(estimates: Estimate | Sequence[Estimate], truths: Any, *, levels: A
     --------
     >>> import halfwidth as hw
     >>> walk = hw.Linear([[1]], None, [[1]], hw.Gaussian(0.1), hw.Gaussian(1.0), hw.Normal([0.0], 1.0))
-    >>> truth, record = hw.simulate(walk, T=200, seed=1)
-    >>> hw.coverage(hw.estimate(walk, record), truth).honest
+    >>> drawn = [hw.simulate(walk, T=50, seed=seed) for seed in range(20)]
+    >>> hw.coverage([hw.estimate(walk, record) for _, record in drawn], [truth for truth, _ in drawn]).honest
     True
     """
     ests, true = _pairs(estimates, truths)
@@ -286,10 +311,4 @@ def _band(p: Array, trials: int) -> tuple[Array, Array]:
 
 
 def _axes(ax: Any) -> Any:
-    if ax is not None:
-        return ax
-    try:
-        from matplotlib.pyplot import subplots
-    except ImportError:
-        raise Missing("`plot` needs matplotlib, which is not installed", hint="pip install halfwidth[plot]") from None
-    return subplots(figsize=(5, 5), layout="constrained")[1]
+    return pyplot().subplots(figsize=(5, 5), layout="constrained")[1] if ax is None else ax

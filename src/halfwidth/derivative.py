@@ -31,9 +31,9 @@ def differences(
 
     Examples
     --------
-    >>> differences(lambda x: x**2, np.array([1.0, 3.0])).round(9)
-    array([[ 2., -0.],
-           [-0.,  6.]])
+    >>> differences(lambda x: x**2, np.array([1.0, 3.0])).round(9) + 0.0
+    array([[2., 0.],
+           [0., 6.]])
     """
     size = np.abs(x) if scale is None else np.asarray(scale)
     h = _STEP * np.where(size > 0.0, size, np.where(x != 0.0, np.abs(x), 1.0))

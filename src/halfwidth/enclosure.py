@@ -23,7 +23,7 @@ import numpy as np
 
 from halfwidth._core import tape_affine
 from halfwidth.array import Array
-from halfwidth.trace import Tape
+from halfwidth.tape import Tape
 
 
 class Affine(NamedTuple):

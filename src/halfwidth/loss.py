@@ -390,7 +390,17 @@ class Markov(_Loss):
         learn_noise: bool = False,
         **more: Any,
     ) -> "Markov":
-        """Return losses whose law is to be learned; the probabilities are prior means. See `Bernoulli.unknown`."""
+        """Return losses whose law is to be learned.
+
+        Parameters
+        ----------
+        stay_received, stay_lost : scalar or (G,) array_like
+            Prior means.
+        worth, learn_noise
+            As for `Bernoulli.unknown`.
+        **more
+            As for `Markov`.
+        """
         found: Markov = _unknown(cls(stay_received, stay_lost, **more), worth, learn_noise)
         return found
 

@@ -19,7 +19,8 @@ from halfwidth.derivative import differences
 from halfwidth.errors import BadShape, BadValue, Refused
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
 from halfwidth.spread import Box, Halfspaces, Normal
-from halfwidth.trace import Untraceable, compiled
+from halfwidth.tape import Untraceable
+from halfwidth.trace import compiled
 from halfwidth.varying import Varying, varying
 
 Prior = Box | Normal
@@ -337,7 +338,18 @@ class Nonlinear:
         return Linearised(*rows)
 
     def slope(self, name: str, x: Array, u: Array | None, dt: float, by: str | None = None) -> tuple[Array, Array]:
-        """Return value and Jacobian of `g` or `h` alone, of arguments that are known to be right; see `linearise`."""
+        """Return value and Jacobian of `g` or `h` alone, of arguments that are known to be right; see `linearise`.
+
+        Parameters
+        ----------
+        name : {"g", "h"}
+        x : (nx,) array
+        u : (nu,) array or None
+        dt : float
+            Step, s.
+        by : {"user", "tape", "differences"}, optional
+            As for `linearise`.
+        """
         f = getattr(self, name)
         more = (u, dt)[: arity(f, 3 if name == "g" else 1) - 1]
         size, angles = (self.nx, self.x_angles) if name == "g" else (self.ny, self.y_angles)

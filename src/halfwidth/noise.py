@@ -31,7 +31,7 @@ class Noise(Protocol):
         ...
 
     def sample(self, rng: np.random.Generator, t: Array, dt: Array) -> Array:
-        """Draw one noise vector a row, (T, n)."""
+        """Draw one noise vector a row, (T, n), for rows at times `t` (T,) that follow steps `dt` (T,), s."""
         ...
 
 
@@ -244,7 +244,14 @@ class Gaussian:
 
 @dataclass(frozen=True, eq=False)
 class Mixed:
-    """Sum of bounded and Gaussian noise, written ``Uniform(q) + Gaussian(Q)``."""
+    """Sum of bounded and Gaussian noise, written ``Uniform(q) + Gaussian(Q)``.
+
+    Parameters
+    ----------
+    uniform : Uniform
+    gaussian : Gaussian
+        Of as many entries.
+    """
 
     uniform: Uniform
     gaussian: Gaussian

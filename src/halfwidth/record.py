@@ -63,6 +63,8 @@ class Record:
         Outputs; NaN, None or masked is missing, per entry.
     u : (T, nu) or (T,) array_like, optional
         Inputs, all present.
+    labels : Labels, optional
+        Names and times of a frame, which estimates are labelled with again; made by `from_frame`.
 
     Raises
     ------
@@ -141,6 +143,11 @@ class Record:
             Times, s.
         outputs : sequence of int, optional
             Which outputs are lost; all if absent.
+
+        Raises
+        ------
+        BadValue
+            If t0 is after t1, or there is no such output.
         """
         if not t0 <= t1:
             raise BadValue(f"`t0` is {t0!r} and `t1` is {t1!r}, t0 <= t1 was expected")
@@ -162,11 +169,18 @@ class Record:
             Step, s; the median step of the record if absent.
         u : (steps, nu) array_like, optional
             Inputs of the new rows; needed if the record has inputs.
+
+        Raises
+        ------
+        BadValue, BadRecord, BadShape
+            If `steps` is no whole number from 1, `dt` is not positive, or `u` does not go with the record.
         """
         if not isinstance(steps, int | np.integer) or steps < 1:
             raise BadValue(f"`steps` is {steps!r}, a whole number from 1 was expected")
         if dt is None:
             dt = float(np.median(np.diff(self.t))) if len(self) > 1 else 1.0
+        if not 0.0 < dt < np.inf:
+            raise BadValue(f"`dt` is {dt!r}, a positive number of seconds was expected", hint="extended(steps, dt=0.1)")
         t = np.concatenate((self.t, self.t[-1] + dt * np.arange(1, steps + 1)))
         y = np.concatenate((self.y, np.full((steps, self.ny), np.nan)))
         if (u is None) != (self.u is None):

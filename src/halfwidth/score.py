@@ -96,7 +96,7 @@ def score(
     BadShape
         If the truth does not have the rows and states of an estimate.
     BadValue
-        If no row lies in `during`.
+        If no row lies in `during`, it is no span, or `states` are not those of the model.
 
     Examples
     --------
@@ -122,10 +122,14 @@ def _row(
         raise BadShape(f"`truth` has shape {x.shape}, {estimate.x.shape} was expected from the estimate")
     rows = np.ones(len(x), dtype=bool)
     if during is not None:
+        if np.size(during) < 2:
+            raise BadValue(f"`during` is {during!r}, two times in seconds were expected", hint="record.gaps()[0]")
         rows = (estimate.t >= during[0]) & (estimate.t <= during[1])
         if not rows.any():
             raise BadValue(f"no row lies between {during[0]:g} s and {during[1]:g} s")
     columns = np.arange(x.shape[1]) if states is None else np.asarray(states)
+    if columns.ndim != 1 or not columns.size or not np.isin(columns, np.arange(-x.shape[1], x.shape[1])).all():
+        raise BadValue(f"`states` is {states!r}, numbers of states from 0 to {x.shape[1] - 1} were expected")
     part = np.ix_(rows, columns)
     error = np.linalg.norm(estimate.x[part] - x[part], axis=1)
     inside = width = widest = None

@@ -73,20 +73,28 @@ def record_html(record: "Record") -> str:
     )
 
 
+def pyplot() -> Any:
+    """Return matplotlib's pyplot.
+
+    Raises
+    ------
+    Missing
+        If matplotlib is not installed.
+    """
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError:
+        raise Missing("`plot` needs matplotlib, which is not installed", hint="pip install 'halfwidth[plot]'") from None
+    return plt
+
+
 def plot(estimate: "Estimate", truth: Any, *, states: Any, level: float, ax: Any) -> Any:
     """Draw states with bands against time; return the axes, one or an array of them."""
     names = _names(estimate)
     chosen = _chosen(names, states)
     if ax is None:
-        try:
-            from matplotlib.pyplot import subplots
-        except ImportError:
-            raise Missing(
-                "`plot` needs matplotlib, which is not installed",
-                hint="pip install halfwidth[plot]",
-            ) from None
         size = (8, 1 + 1.8 * len(chosen))
-        _, made = subplots(len(chosen), 1, sharex=True, figsize=size, layout="constrained")
+        _, made = pyplot().subplots(len(chosen), 1, sharex=True, figsize=size, layout="constrained")
         axes = np.atleast_1d(made)
     else:
         axes = np.atleast_1d(np.asarray(ax, dtype=object))

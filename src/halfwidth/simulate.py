@@ -91,6 +91,9 @@ def simulate(
     if inputs is not None and inputs.ndim == 1:
         inputs = inputs[:, None]
     given = None if t is None else real(t, "t")
+    for name, value in (("u", inputs), ("t", given)):
+        if value is not None and value.ndim == 0:
+            raise BadShape(f"`{name}` is {value:g}, a row for each time was expected", hint="simulate(model, T=100)")
     sized = inputs if inputs is not None else given
     if T is None and sized is None:
         raise BadValue("neither `u` nor `T` nor `t` is given", hint="simulate(model, T=100, seed=1)")

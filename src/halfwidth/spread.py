@@ -108,7 +108,13 @@ class Box:
         return Box(lo, hi, guaranteed=self.guaranteed)
 
     def sample(self, rng: np.random.Generator) -> Array:
-        """Draw one state uniformly; a side without end is refused."""
+        """Draw one state (nx,) uniformly.
+
+        Raises
+        ------
+        BadValue
+            If a side has no end.
+        """
         if not (np.isfinite(self.lo).all() and np.isfinite(self.hi).all()):
             raise BadValue(
                 "`x0` is an infinite box, so no state can be drawn from it",

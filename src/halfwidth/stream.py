@@ -149,6 +149,8 @@ def _default(model: Model) -> Any:
             return method
         reasons.append(reason)
     message, hint = hinted(reasons[0])
+    if methods.load("Window")(methods.load("Posterior")(), memory=25).refuses(model) is None:
+        hint = "stream(model, Window(Posterior(), memory=25))"
     raise Refused(f"no default method runs on a stream of this model; {message}", hint=hint)
 
 

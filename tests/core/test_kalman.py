@@ -9,16 +9,6 @@ from halfwidth import _core
 SIZES = [(n, m) for n in range(1, 10) for m in range(1, 6)] + [(11, 3)]
 
 
-@pytest.fixture(params=["avx2", "base"])
-def isa(request):
-    """Both builds of the kernels, where this machine can run them."""
-    was = _core.isa()
-    if not _core.use_isa(request.param == "avx2"):
-        pytest.skip("this machine has no AVX2")
-    yield request.param
-    _core.use_isa(was == "avx2")
-
-
 def spd(rng, n):
     a = rng.normal(size=(n, n))
     return a @ a.T + 0.5 * n * np.eye(n)

@@ -87,14 +87,6 @@ SHAPES = [
 IDS = [" ".join(f"{k}={v}" for k, v in s.items()) for s in SHAPES]
 
 
-@pytest.fixture(params=[True, False], ids=["avx2", "base"])
-def isa(request):
-    if not _core.use_isa(request.param):
-        pytest.skip("this machine has no AVX2")
-    yield
-    _core.use_isa(True)
-
-
 @pytest.mark.parametrize("shape", SHAPES, ids=IDS)
 @pytest.mark.usefixtures("isa")
 class TestTwin:

@@ -9,15 +9,6 @@ from halfwidth import _core
 FORMS = ("ellipsoid", "zonotope", "combined")
 
 
-@pytest.fixture(params=["avx2", "base"])
-def isa(request):
-    was = _core.isa()
-    if not _core.use_isa(request.param == "avx2"):
-        pytest.skip("this machine has no AVX2")
-    yield request.param
-    _core.use_isa(was == "avx2")
-
-
 def spd(rng, n, scale=1.0):
     a = rng.normal(size=(n, n))
     return scale * (a @ a.T + 0.1 * np.eye(n))

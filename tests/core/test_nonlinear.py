@@ -14,16 +14,6 @@ SPREADS = {"extended": lambda n: (0.0, 0.0, 0.0), "unscented": lambda n: tuple(U
            "narrow": lambda n: tuple(UnscentedKalman(alpha=0.5, kappa=1.0).spread(n))}  # fmt: skip
 
 
-@pytest.fixture(params=["avx2", "base"])
-def isa(request):
-    """Both builds of the kernels, where this machine can run them."""
-    was = _core.isa()
-    if not _core.use_isa(request.param == "avx2"):
-        pytest.skip("this machine has no AVX2")
-    yield request.param
-    _core.use_isa(was == "avx2")
-
-
 def problem(n, m, seed, T=25, *, turning=False):
     """A random mildly nonlinear model with inputs, gaps and correlated noise, as arrays for the kernel."""
     rng = np.random.default_rng(seed)

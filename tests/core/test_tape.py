@@ -6,15 +6,7 @@ import pytest
 from halfwidth import _core
 from halfwidth.trace import trace
 
-
-@pytest.fixture(params=["avx2", "base"], autouse=True)
-def isa(request):
-    """Both builds of the kernels, where this machine can run them."""
-    was = _core.isa()
-    if not _core.use_isa(request.param == "avx2"):
-        pytest.skip("this machine has no AVX2")
-    yield request.param
-    _core.use_isa(was == "avx2")
+pytestmark = pytest.mark.usefixtures("isa")
 
 
 def f(x):

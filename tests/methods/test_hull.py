@@ -1,7 +1,6 @@
 """Hull: as tight as the exact linear program over all data, never inside it, and honest where there is nothing."""
 
 import dataclasses
-import importlib.util
 import json
 import pathlib
 import subprocess
@@ -95,10 +94,8 @@ def test_a_lag_lies_between_filter_and_smoother():
     np.testing.assert_allclose((lo[11], hi[11]), (low, high), atol=1e-3 * (high - low).min())
 
 
-def test_no_violation_in_a_hundred_thousand_state_steps():
-    spec = importlib.util.spec_from_file_location("bench_hull", ROOT / "benchmarks" / "hull.py")
-    bench = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(bench)
+def test_no_violation_in_a_hundred_thousand_state_steps(bench):
+    bench = bench("hull")
     steps = wrong = loose = sides = 0
     seed = 0
     while steps < 100_000:

@@ -8,7 +8,8 @@ from tests import naive_loss as naive
 
 import halfwidth as hw
 from halfwidth.loss import last_reported
-from halfwidth.methods.loss import LossStream, _modes, linear_rows
+from halfwidth.methods._loss_rows import linear_rows, outputs_and_modes
+from halfwidth.methods._loss_stream import LossStream
 from halfwidth.reproduce import paper001 as paper
 
 CASES = paper.scenarios()
@@ -43,7 +44,7 @@ def car(loss=None, R=None, seed=0, T=80):
 def problem(model, record, loss):
     """The arrays of the naive twins."""
     rows = linear_rows(model, record)
-    y, modes = _modes(rows, loss, record)
+    y, modes = outputs_and_modes(rows, loss, record)
     return {
         "A": rows.A, "b": np.zeros((1, model.nx)) if rows.b is None else rows.b, "Q": rows.Q, "C": modes.C,
         "d": np.zeros((1, *modes.C.shape[1:3])) if modes.d is None else modes.d, "R": modes.R, "Pi": modes.Pi,

@@ -5,7 +5,8 @@ import pytest
 
 import halfwidth as hw
 from halfwidth.methods import _sample
-from halfwidth.methods._sample import convergence, sample
+from halfwidth.methods._convergence import convergence
+from halfwidth.methods._sample import sample
 
 NAN = float("nan")
 A, Q, R = np.array([[0.9, 0.2], [0.0, 0.8]]), np.array([0.5, 0.4]), np.array([0.3, 0.5])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import halfwidth as hw
-from halfwidth.methods.sequential import LinearRows
+from halfwidth.methods._linearised import LinearRows
 
 NAN = float("nan")
 SMALL = hw.Uniform.unknown(at_most=1.0)

@@ -16,7 +16,7 @@ import pytest
 from tests.vehicle.drives import drive, save
 
 import halfwidth as hw
-from halfwidth.shells import cli, commands
+from halfwidth.shells import cli, say
 
 GOOD, INTERNAL, USAGE, BAD, NO_ESTIMATE, LIMIT = 0, 1, 2, 3, 4, 6
 
@@ -97,7 +97,13 @@ def test_completion():
         (["chekc"], "Did you mean 'check'?"),
         (["check"], "LOG"),
         (["check", "--jsn", "x"], "--json"),
-        (["outages", "x", "--starts", "0"], "--starts"),
+        (["outages", "x", "--starts", "0"], "'0'"),
+        (["outages", "x", "--starts=-3"], "'-3'"),
+        (["outages", "x", "--seed", "one"], "hint: halfwidth outages drive.csv --lengths 1,5,30"),
+        (["fill"], "hint: halfwidth fill drive.csv -o drive.gpx"),
+        (["fill", "x", "-o", "a.csv", "--guaranteed", "4"], "hint: halfwidth fill drive.csv -o drive.gpx"),
+        (["fill", "x", "-o", "a.csv", "--limits", "speed"], "`--limits` is 'speed': "),
+        (["outages", "x", "--plot", "o.doc"], "`--plot` is 'o.doc', a name ending in .png, .svg or .pdf"),
         (["outages", "x", "--lengths", "one"], "`--lengths` is 'one', positive numbers"),
         (["outages", "x", "--lengths", "1,-2"], "positive numbers"),
         (["outages", "x", "--methods", "nope"], "there is no method 'nope', one of"),
@@ -106,8 +112,8 @@ def test_completion():
         (["fill", "x", "-o", "out.csv", "--level", "nan"], "a probability"),
         (["fill", "x", "-o", "out.csv", "--clock-offset", "inf"], "finite number of seconds"),
         (["fill", "x", "-o", "out.csv", "--method", "linaer"], "hint: linear"),
-        (["fill", "x", "-o", "out.doc"], ".gpx"),
-        (["fill", "x", "-o", "-", "--format", "doc"], ".gpx"),
+        (["fill", "x", "-o", "out.doc"], "hint: -o track.gpx, or --format gpx"),
+        (["fill", "x", "-o", "-", "--format", "doc"], "`--format` is 'doc', one of .csv, "),
         (["fill", "x", "-o", "-", "--json"], "both claim standard output"),
         (["fill", "x", "-o", "-", "--report", "-"], "both claim standard output"),
         (["fill", "x", "-o", "no/such/folder/out.csv"], "hint: mkdir -p no/such/folder"),
@@ -236,6 +242,24 @@ def test_the_input_is_never_overwritten(log, tmp_path, capsys):
 def test_a_place_that_cannot_be_written(name, words, log, tmp_path, capsys):
     assert cli.run(["fill", log, "-o", str(tmp_path / name) if name else str(tmp_path)]) == USAGE
     assert words in capsys.readouterr().err
+
+
+def test_a_folder_that_is_not_ours_is_told_before_any_work(log, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr("halfwidth.job.run", None)
+    assert cli.run(["fill", log, "-o", str(tmp_path / "out.csv")]) == USAGE
+    assert f"`{tmp_path}` takes no files from you" in capsys.readouterr().err
+
+
+def test_a_figure_without_matplotlib_is_told_before_any_work(log, monkeypatch, capsys):
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    assert cli.run(["outages", log, "--plot", "o.png"]) == USAGE
+    assert "hint: pip install 'halfwidth[plot]'" in capsys.readouterr().err
+
+
+def test_the_short_help_is_not_cut(capsys):
+    assert cli.run(["-h"]) == GOOD
+    assert "..." not in capsys.readouterr().out.partition("Commands:")[2]
 
 
 def test_a_folder_that_takes_no_files(log, capsys):
@@ -419,14 +443,14 @@ def test_doctor(capsys):
 def test_progress_shows_on_a_terminal_only(monkeypatch):
     shown = io.StringIO()
     monkeypatch.setattr(sys, "stderr", shown)
-    with commands._working("filling", quiet=False) as progress:
+    with say.working("filling", quiet=False) as progress:
         assert progress is None
     shown.isatty = lambda: True
-    with commands._working("filling", quiet=True) as progress:
+    with say.working("filling", quiet=True) as progress:
         assert progress is None
     assert shown.getvalue() == ""
     monkeypatch.setenv("TERM", "xterm")
-    with commands._working("filling", quiet=False) as progress:
+    with say.working("filling", quiet=False) as progress:
         progress(0.25, "em, 1 s")
         deadline = time.monotonic() + 5
         while "25 %" not in shown.getvalue() and time.monotonic() < deadline:
@@ -479,6 +503,6 @@ def test_fill_on_a_map_within_limits(log, tmp_path):
     assert found.returncode == GOOD, found.stderr
     assert json.loads(found.stdout)["method"] == "paper002"
     wrong = done("fill", str(log), "-o", str(tmp_path / "other.csv"), "--limits", "speed")
-    assert wrong.returncode == BAD
+    assert wrong.returncode == USAGE
     assert b"NAME=SIZE" in wrong.stderr
     assert done(*given, "--force", "--method", "em").returncode == BAD

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.solvers import lp
-from halfwidth.solvers.lp import HIGHS, PIQP, Claim, Program, Solver, Verdict, certifies, highs, judge, solve
+from halfwidth.solvers.lp import certifies, judge, solve
+from halfwidth.solvers.program import Claim, Program, Solver, Verdict
+from halfwidth.solvers.stock import HIGHS, PIQP, highs
 
 INF = np.inf
 

@@ -1,26 +1,15 @@
 """The benchmark that sets `fill` beside single methods: the same positions as theirs, and no luck in the last ratio."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 from tests.vehicle.known import known
 
 from halfwidth.vehicle.fill import fill, prepared
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-
 
 @pytest.fixture(scope="module")
-def accuracy():
-    """The benchmark as a module; what it imports from its neighbour is found beside it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(BENCHMARKS))
-        spec = importlib.util.spec_from_file_location("bench_accuracy", BENCHMARKS / "accuracy.py")
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        yield module
+def accuracy(bench):
+    return bench("accuracy")
 
 
 @pytest.mark.parametrize("name", ["linear", "cv", "em"])

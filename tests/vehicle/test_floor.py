@@ -1,29 +1,19 @@
 """The floor of the error across gaps: nothing where fixes are right, a known amount where they jump."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from halfwidth.vehicle import simulate_drive
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-
 #: Where the fixes jump, s, and by how much, m; the outage about it and one without.
 AT, JUMP, OUTAGE, CALM, LENGTH = 120.0, 2.0, 115.0, 60.0, 10.0
 
 
 @pytest.fixture(scope="module")
-def floor():
-    """The benchmark as a module; what it imports from its neighbour is found beside it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(BENCHMARKS))
-        spec = importlib.util.spec_from_file_location("bench_floor", BENCHMARKS / "floor.py")
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        yield module
+def floor(bench):
+    return bench("floor")
 
 
 @pytest.fixture(scope="module")

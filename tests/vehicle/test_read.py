@@ -1,6 +1,7 @@
 """One drive in many layouts gives one log; what is repaired is said."""
 
 import gzip
+import re
 import sys
 
 import numpy as np
@@ -326,12 +327,14 @@ def test_fields_of_the_log_may_be_named_too(tmp_path):
     [
         ("lat", "ROLE=COLUMN is expected"),
         ("lat=nope", "has no such column; found: t_s, lat_deg"),
+        ("lta=x", "hint: --columns lat=NAME,lon=NAME"),
+        ("lat=lat_deg[parsec]", "hint: --columns lat=lat_deg[deg]"),
         ("latitude=lat_deg", "names the role 'latitude', one of time, lat"),
         ("speed=speed_mps[furlong]", "gives the unit 'furlong' for speed"),
     ],
 )
 def test_a_wrong_name_is_refused(columns, words, tmp_path):
-    with pytest.raises(hw.BadLog, match=words.replace("(", r"\(")):
+    with pytest.raises(hw.BadLog, match=re.escape(words)):
         hw.vehicle.read(save(tmp_path / "log.csv", TRUE), columns=columns)
 
 

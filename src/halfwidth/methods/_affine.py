@@ -20,7 +20,8 @@ from halfwidth.model import Nonlinear, arity
 from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.spread import Box
-from halfwidth.trace import Tape, Untraceable, compiled
+from halfwidth.tape import Tape, Untraceable
+from halfwidth.trace import compiled
 
 _TURN = 2.0 * np.pi
 

@@ -295,7 +295,9 @@ def bounded(
 
 def stock(ask: Question) -> tuple[Array, Array]:
     """Ask the stock linear programming solver for multipliers."""
-    from halfwidth.solvers.lp import HIGHS, Program, solve
+    from halfwidth.solvers.lp import solve
+    from halfwidth.solvers.program import Program
+    from halfwidth.solvers.stock import HIGHS
 
     M, low, high = sparse_rows(ask.rows)
     nx = ask.rows.nx

@@ -110,7 +110,9 @@ def _least_growth(rows: Rows, lo: Array, hi: Array) -> tuple[float, Array, Array
     """Return the least factor on the half-widths, the multipliers (T, nx + ny) of its proof, and the states."""
     import scipy.sparse as sp
 
-    from halfwidth.solvers.lp import HIGHS, Program, solve
+    from halfwidth.solvers.lp import solve
+    from halfwidth.solvers.program import Program
+    from halfwidth.solvers.stock import HIGHS
 
     M, low, high = sparse_rows(rows)
     noise = np.tile(np.arange(rows.nx + rows.ny) < rows.nx + rows.ny - rows.walls, rows.T)

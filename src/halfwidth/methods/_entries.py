@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from halfwidth.array import Array
-from halfwidth.methods.sequential import filled
+from halfwidth.methods._linearised import filled
 from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status

@@ -14,18 +14,18 @@ Chinneck (2008), Feasibility and Infeasibility in Optimization: elastic programs
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.array import Array
+from halfwidth.methods._task import Task
 from halfwidth.model import Linear
 from halfwidth.record import Record
-from halfwidth.solvers.lp import HIGHS, Program, Solution, Solver, Verdict, solve
-
-if TYPE_CHECKING:
-    from halfwidth.methods.map import Task
+from halfwidth.solvers.lp import Solution, solve
+from halfwidth.solvers.program import Program, Solver, Verdict
+from halfwidth.solvers.stock import HIGHS
 
 #: Excesses below this share of sigma count as 0.
 _ZERO = 1e-5
@@ -35,7 +35,7 @@ _PART = 1e-6
 _MOST = 200
 
 
-def inflation(task: "Task", solvers: Sequence[Solver], grow: NDArray[np.bool_]) -> tuple[float | None, Array | None]:
+def inflation(task: Task, solvers: Sequence[Solver], grow: NDArray[np.bool_]) -> tuple[float | None, Array | None]:
     """Return the least common factor on the half-widths that fits a trajectory, and that trajectory.
 
     The caps of unknown half-widths grow, and known ones where `grow` says so; half-widths without a cap bound nothing.
@@ -70,7 +70,7 @@ def inflation(task: "Task", solvers: Sequence[Solver], grow: NDArray[np.bool_]) 
 
 
 def elastic(
-    task: "Task", solvers: Sequence[Solver], model: Linear, record: Record, contradiction: bool
+    task: Task, solvers: Sequence[Solver], model: Linear, record: Record, contradiction: bool
 ) -> tuple[Array | None, list[dict[str, Any]], list[dict[str, Any]]]:
     """Return the trajectory of least total excess, the rows that exceed there, and rows that contradict each other.
 
@@ -86,19 +86,19 @@ def elastic(
     return task.point(found.x), named(task, excess, model, record), [_named(task, int(k), model, record) for k in core]
 
 
-def named(task: "Task", excess: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
+def named(task: Task, excess: Array, model: Linear, record: Record) -> list[dict[str, Any]]:
     """Describe the rows that exceed their bounds, the worst first; `excess` (rows,) is in units of sigma."""
     over = np.argsort(-excess, kind="stable")
     return [_named(task, int(k), model, record, excess[k]) for k in over[excess[over] > _ZERO]]
 
 
-def _bounded(task: "Task") -> NDArray[np.intp]:
+def _bounded(task: Task) -> NDArray[np.intp]:
     """Return the rows whose half-widths all have a cap."""
     limit = np.where(task.free, task.highest, task.lowest)
     return np.flatnonzero(np.asarray(task.S @ np.isinf(limit).astype(float)) == 0)
 
 
-def _excess(task: "Task", rows: NDArray[np.intp]) -> Program:
+def _excess(task: Task, rows: NDArray[np.intp]) -> Program:
     """Return the program of the least total excess of some rows over their caps, in units of sigma."""
     import scipy.sparse as sp
 
@@ -126,7 +126,7 @@ def _proof(rows: NDArray[np.intp], found: Solution) -> NDArray[np.intp]:
     return rows[y > _PART * max(float(y.max(initial=0.0)), 1e-300)]
 
 
-def _irreducible(task: "Task", rows: NDArray[np.intp]) -> NDArray[np.intp]:
+def _irreducible(task: Task, rows: NDArray[np.intp]) -> NDArray[np.intp]:
     """Leave out every row without which the others still contradict each other."""
 
     def contradict(some: NDArray[np.intp]) -> bool:
@@ -151,7 +151,7 @@ def _irreducible(task: "Task", rows: NDArray[np.intp]) -> NDArray[np.intp]:
     return rows
 
 
-def _named(task: "Task", k: int, model: Linear, record: Record, excess: float | None = None) -> dict[str, Any]:
+def _named(task: Task, k: int, model: Linear, record: Record, excess: float | None = None) -> dict[str, Any]:
     """Describe row k; its excess is in its own unit."""
     rows = task.rows
     j, t = int(rows.group[k]), int(rows.row[k])

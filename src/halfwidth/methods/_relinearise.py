@@ -17,7 +17,8 @@ from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.result import Status
 from halfwidth.spread import Normal
-from halfwidth.trace import Untraceable, compiled
+from halfwidth.tape import Untraceable
+from halfwidth.trace import compiled
 
 if TYPE_CHECKING:
     from halfwidth.methods._carry import Known, Start

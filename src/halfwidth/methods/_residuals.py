@@ -28,7 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.array import Array
-from halfwidth.model import Linear
+from halfwidth.model import Linear, Model
+from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.varying import Varying
 
@@ -375,3 +376,13 @@ def _tall(stack: Array, rows: int) -> Array:
     """Pad the matrices of a stack with zero rows, at least to the number given."""
     lack = max(0, rows - stack.shape[1])
     return np.pad(stack, ((0, 0), (0, lack), (0, 0)))
+
+
+def half_width_bounds(model: Model) -> tuple[Array, Array]:
+    """Return floors and caps of the half-widths (q, r), each (p,)."""
+    assert isinstance(model.w, Uniform)
+    assert isinstance(model.e, Uniform)
+    return (
+        np.r_[np.broadcast_to(model.w.at_least, model.nx), np.broadcast_to(model.e.at_least, model.ny)].astype(float),
+        np.r_[np.broadcast_to(model.w.at_most, model.nx), np.broadcast_to(model.e.at_most, model.ny)].astype(float),
+    )

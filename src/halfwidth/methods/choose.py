@@ -12,9 +12,9 @@ import numpy as np
 
 from halfwidth.array import Array, generator
 from halfwidth.errors import BadValue
+from halfwidth.methods._linearised import filled
 from halfwidth.methods._protocol import Estimator
 from halfwidth.methods._sites import gaussian_part, uniform_part
-from halfwidth.methods.sequential import filled
 from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
@@ -84,7 +84,7 @@ def compare(
     Raises
     ------
     BadValue
-        If there is no model, or a setting is out of its domain.
+        If there is no model, one is none, or a setting is out of its domain.
 
     Examples
     --------
@@ -99,6 +99,11 @@ def compare(
     """
     if not models:
         raise BadValue("`models` is empty, at least one named model was expected")
+    if not isinstance(models, Mapping):
+        raise BadValue(f"`models` is a {type(models).__name__}, models by name were expected", hint='{"still": model}')
+    for name, model in models.items():
+        if not isinstance(model, Linear):
+            raise BadValue(f"`models` has {model!r} under {name!r}, a Linear was expected")
     if not 0 < left_out < 1 or folds < 1:
         raise BadValue(f"`left_out` is {left_out!r} and `folds` {folds!r}: a share below 1 and a positive number")
     from halfwidth.methods.posterior import Posterior

@@ -23,16 +23,17 @@ import numpy as np
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.errors import BadValue
+from halfwidth.errors import BadValue, Refused, hinted
+from halfwidth.methods._linearised import expected, filled
 from halfwidth.methods._protocol import Estimator
 from halfwidth.methods._sites import Sites, sites
 from halfwidth.methods._sliding import Sliding, Solved
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.posterior import Answer, Posterior
-from halfwidth.methods.sequential import expected, filled
 from halfwidth.methods.window import Window
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record
+from halfwidth.show import pyplot
 
 #: Sweeps, agreement of moments and damping at nodes, where the evidence of two chains is compared.
 _SWEEPS, _CLOSE, _DAMPING = 100, 1e-4, 0.7
@@ -79,19 +80,18 @@ class MemoryChoice:
     def plot(self, ax: Any = None) -> Any:
         """Draw evidence, or the score where there is none, against memory; returns the axes.
 
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            New ones if absent.
+
         Raises
         ------
         Missing
             If matplotlib is not installed.
         """
-        try:
-            import matplotlib.pyplot as plt
-        except ImportError as exc:
-            from halfwidth.errors import Missing
-
-            raise Missing("`plot` needs matplotlib", hint="pip install 'halfwidth[plot]'") from exc
         if ax is None:
-            _, ax = plt.subplots()
+            _, ax = pyplot().subplots()
         value = self.score if self.evidence is None else self.evidence
         ax.errorbar(self.memories, value, yerr=self.spread, marker="o", capsize=3)
         ax.axvline(self.best, linestyle="--", color="grey")
@@ -129,9 +129,17 @@ def choose_memory(
     Raises
     ------
     BadValue
-        If no row is left to be foretold.
+        If there are no memories, or no row is left to be foretold.
+    Refused
+        If the method cannot work on the model.
     """
     method = BatchLP() if method is None else method
+    if not len(memories):
+        raise BadValue("`memories` is empty, numbers of rows were expected", hint="memories=(5, 15, 50)")
+    reason = Window(method, min(memories), recall=recall).refuses(model)
+    if reason is not None:
+        message, hint = hinted(reason)
+        raise Refused(message, hint=hint)
     first = min(max(memories), len(record) // 2)
     if not record.seen[max(first, 1) :].any():
         raise BadValue(f"`record` has no output to foretell after its first {first} rows", hint="a longer record")

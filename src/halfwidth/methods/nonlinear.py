@@ -31,7 +31,8 @@ from halfwidth.noise import Gaussian, unknown_variances
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Normal
-from halfwidth.trace import Tape, Untraceable, compiled
+from halfwidth.tape import Tape, Untraceable
+from halfwidth.trace import compiled
 from halfwidth.varying import Varying
 
 #: Points where a tape is compared with its function before a run, and rows of the answer after it.

@@ -29,7 +29,8 @@ from halfwidth.noise import Gaussian, Mixed, Noise, Uniform, unknown_variances
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box, Cloud, Halfspaces
-from halfwidth.trace import Untraceable, compiled
+from halfwidth.tape import Untraceable
+from halfwidth.trace import compiled
 
 #: Entries (rows x particles x states) up to which every particle is returned; beyond, each row is thinned.
 _KEPT = 20_000_000

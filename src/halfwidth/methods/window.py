@@ -37,7 +37,9 @@ from numpy.typing import NDArray
 import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadValue, Refused
+from halfwidth.methods._linearised import expected
 from halfwidth.methods._protocol import Estimator, typed
+from halfwidth.methods._residuals import half_width_bounds
 from halfwidth.methods._sliding import (
     TOL,
     Forecasts,
@@ -51,7 +53,6 @@ from halfwidth.methods._sliding import (
     window_starts,
 )
 from halfwidth.methods.map import BatchLP
-from halfwidth.methods.sequential import expected, half_width_bounds
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
@@ -337,7 +338,11 @@ def ensemble_interval(estimate: Estimate, kappa: float = 1.0, *, newest: bool = 
     ------
     Refused
         If the estimate is not one of `Window`.
+    BadValue
+        If `kappa` is below 0 or not finite.
     """
+    if not 0.0 <= kappa < np.inf:
+        raise BadValue(f"`kappa` is {kappa!r}, a finite number from 0 was expected", hint="kappa=1.0")
     names = ("newest_low", "newest_high", "newest_windows") if newest else ("low", "high", "windows")
     if names[-1] not in estimate.info:
         raise Refused(f"`{estimate.method}` is no `Window`, so its states have one estimate each")

@@ -5,11 +5,13 @@ reference are those printed in the papers; notes say what cannot match and why.
 """
 
 import importlib
+import pathlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from halfwidth.errors import BadValue
+from halfwidth.show import pyplot
 
 #: Papers that are reproduced here, by number.
 PAPERS: dict[str, str] = {"000": "paper000", "001": "paper001", "002": "paper002", "003": "paper003", "004": "paper004"}
@@ -63,6 +65,15 @@ def tables(number: str, *, quick: bool = False, logs: Sequence[str] = ()) -> tup
         raise BadValue(f"paper {number} is not about vehicles, so `logs` has no use: {', '.join(ON_LOGS)} are")
     found: tuple[Table, ...] = module.tables(quick=quick, logs=tuple(logs)) if logs else module.tables(quick=quick)
     return found
+
+
+def canvas(folder: str | pathlib.Path) -> tuple[Any, pathlib.Path]:
+    """Return pyplot, drawing into files, and a folder for them, made where it is not there."""
+    plt = pyplot()
+    plt.switch_backend("Agg")
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    return plt, folder
 
 
 def _cell(value: Any) -> str:

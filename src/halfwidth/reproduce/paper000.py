@@ -22,7 +22,7 @@ from halfwidth.methods.map import BatchLP
 from halfwidth.model import Linear
 from halfwidth.noise import Noise, Uniform
 from halfwidth.record import Record
-from halfwidth.reproduce import Table
+from halfwidth.reproduce import Table, canvas
 from halfwidth.reproduce.drives import TOLERANCE, log_table, tolerance_row
 from halfwidth.simulate import simulate
 from halfwidth.spread import Box, Normal
@@ -124,13 +124,7 @@ def tables(*, quick: bool = False, logs: Sequence[str] = ()) -> tuple[Table, ...
 
 def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.Path]:
     """Draw both figures into a folder; returns the files."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder = pathlib.Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    plt, folder = canvas(folder)
     files = []
     for number, table in ((2, figure_two(quick=quick)), (3, figure_three(quick=quick))):
         figure, ax = plt.subplots(figsize=(5, 3))

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 import halfwidth as hw
 from halfwidth.array import Array
-from halfwidth.reproduce import Table
+from halfwidth.reproduce import Table, canvas
 
 BURSTS = (0.95, 0.85)
 
@@ -352,13 +352,7 @@ def _cell(value: float, digits: int) -> float | None:
 
 def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.Path]:
     """Draw accuracy against cost, and one crossing target, into a folder; returns the files."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder = pathlib.Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    plt, folder = canvas(folder)
     files = [folder / "paper001_trade.png", folder / "paper001_crossing.png"]
     figure, axes = plt.subplots(2, 2, figsize=(9, 7), constrained_layout=True)
     for axis, (name, case) in zip(axes.flat, scenarios().items(), strict=True):

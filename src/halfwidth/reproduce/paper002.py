@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 
 from halfwidth.array import Array
-from halfwidth.reproduce import Table
+from halfwidth.reproduce import Table, canvas
 from halfwidth.reproduce.drives import TOLERANCE, log_table, tolerance_row
 from halfwidth.vehicle import simulate_drive
 from halfwidth.vehicle.align import calibrated
@@ -125,13 +125,7 @@ def tables(*, quick: bool = False, logs: Sequence[str] = ()) -> tuple[Table, ...
 
 def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.Path]:
     """Draw the course of the errors and the error against length into a folder; returns the files."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder = pathlib.Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    plt, folder = canvas(folder)
     files = []
     t, found = errors(0, LENGTH)
     figure, axes = plt.subplots(2, 2, figsize=(7, 4), sharex=True, sharey=True)

@@ -26,7 +26,7 @@ from halfwidth.methods.window import Window, ensemble_interval
 from halfwidth.model import Linear
 from halfwidth.noise import Gaussian, Uniform
 from halfwidth.record import Record
-from halfwidth.reproduce import Table
+from halfwidth.reproduce import Table, canvas
 from halfwidth.result import Estimate
 from halfwidth.spread import Box, Normal
 
@@ -296,7 +296,8 @@ def central_gain(*, quick: bool = False) -> Table:
     """Filter error of the central point beside the optimal point and a simplex vertex."""
     from halfwidth.methods._sliding import window_starts
     from halfwidth.methods.window import window_chain
-    from halfwidth.solvers.lp import HIGHS, solve
+    from halfwidth.solvers.lp import solve
+    from halfwidth.solvers.stock import HIGHS
 
     every, seeds = (40, range(1)) if quick else (40, range(3))
     memory, body = 25, []
@@ -336,13 +337,7 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
     Figure 1 shows the estimate of F12 over time, figure 2 the interval of the third state, figure 3 the time of a row
     against the number of states; table I is drawn with the paper's values beside ours.
     """
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder = pathlib.Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    plt, folder = canvas(folder)
     rows = 400 if quick else T
     drawn, model = draw(0, rows=rows), system(unknown=True)
     runs = {memory: lsu(drawn, memory, model) for memory in (5, 25)}

@@ -18,7 +18,7 @@ import numpy as np
 from halfwidth import fusion
 from halfwidth.array import Array
 from halfwidth.fusion import Fused, Source, fuse
-from halfwidth.reproduce import Table
+from halfwidth.reproduce import Table, canvas
 
 Z = 12.0
 N = 1000
@@ -188,13 +188,7 @@ def tables(*, quick: bool = False) -> tuple[Table, ...]:
 
 def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.Path]:
     """Draw both figures of the paper into a folder; returns the files."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder = pathlib.Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    plt, folder = canvas(folder)
     files = []
     n = 200 if quick else N
     for number, (name, run) in enumerate(

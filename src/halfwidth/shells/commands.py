@@ -4,28 +4,44 @@ Plain help without colours, so that `--help` starts fast and pipes well; everyth
 imported by the command that needs it.
 """
 
-import json
 import math
 import os
 import shlex
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from halfwidth.errors import BadValue, DataQualityWarning
+from halfwidth.errors import DataQualityWarning
 from halfwidth.shells import cli
+from halfwidth.shells.flags import (
+    UsageError,
+    ending_known,
+    estimator_known,
+    figure_known,
+    finite,
+    limits_known,
+    method_known,
+    numbers,
+    usage,
+    with_example,
+    writable,
+)
+from halfwidth.shells.layout import (
+    SCHEMA_VERSION,
+    about,
+    estimate_json,
+    model_file,
+    states,
+    table_bytes,
+    track_json,
+)
+from halfwidth.shells.say import out, print_json, printable, reader, words, working
 
-SCHEMA_VERSION = 1
-
-#: Typer brings its own click in some versions and uses the installed one in others.
-_UsageError: Any = typer.BadParameter.__bases__[0]
-_ClickError: Any = _UsageError.__bases__[0]
+_ClickError: Any = UsageError.__bases__[0]
 
 app = typer.Typer(
     name="halfwidth",
@@ -56,7 +72,9 @@ def call(args: list[str]) -> int:
     except typer.Abort:
         raise KeyboardInterrupt from None
     except _ClickError as error:
-        error.show(file=sys.stderr)
+        asked: Any = getattr(command, "commands", {}).get(args[0] if args else "")
+        example = (getattr(asked, "epilog", None) or "").removeprefix("Example: ")
+        with_example(error, args, example).show(file=sys.stderr)
         return cli.USAGE
     return code if isinstance(code, int) else cli.GOOD
 
@@ -166,32 +184,30 @@ def fill(
     from halfwidth.vehicle.formats.layout import parse_columns
 
     if output is None and report is None and not json_ and not dry_run:
-        raise _usage("fill has nowhere to put the track", "-o OUT, or -o - for standard output")
+        raise usage("fill has nowhere to put the track", "-o OUT, or -o - for standard output")
     if not 0 < level < 1:
-        raise _usage(f"`--level` is {level:g}, a probability between 0 and 1 is expected", "--level 0.9")
-    _finite("--clock-offset", clock_offset)
+        raise usage(f"`--level` is {level:g}, a probability between 0 and 1 is expected", "--level 0.9")
+    finite("--clock-offset", clock_offset)
     if json_ and "-" in (output, report):
-        raise _usage("`--json` and an output of `-` both claim standard output", "-o FILE")
+        raise usage("`--json` and an output of `-` both claim standard output", "-o FILE")
     if output == "-" and report == "-":
-        raise _usage("`-o` and `--report` both claim standard output", "--report FILE")
+        raise usage("`-o` and `--report` both claim standard output", "--report FILE")
     if output is not None and report is not None and os.path.abspath(output) == os.path.abspath(report):
-        raise _usage(f"`-o` and `--report` both claim `{output}`", "--report drive.html")
-    _method_known(method)
+        raise usage(f"`-o` and `--report` both claim `{output}`", "--report drive.html")
+    method_known(method)
     for path in (output, report):
-        _writable(path, log, force)
+        writable(path, log, force)
     if output is not None:
-        _ending_known(output, format_)
+        ending_known(output, format_)
     if guaranteed is not None and not all(0 < v < math.inf for v in guaranteed):
-        raise _usage(f"`--guaranteed` is {guaranteed[0]:g} {guaranteed[1]:g}, two positive numbers are expected",
+        raise usage(f"`--guaranteed` is {guaranteed[0]:g} {guaranteed[1]:g}, two positive numbers are expected",
                      "--guaranteed 4 3")  # fmt: skip
     settings: dict[str, Any] = {"clock_offset": clock_offset}
     settings |= {name: value for name, value in (("second", second), ("roads", map_)) if value is not None}
     if guaranteed is not None:
         settings["guaranteed"] = list(guaranteed)
     if limits is not None:
-        from halfwidth.vehicle.antennas import parsed_limits
-
-        settings["limits"] = parsed_limits(limits)
+        settings["limits"] = limits_known(limits)
     job = Job("fill", log, method=method, level=level, settings=settings, columns=parse_columns(columns or ""))
     if dry_run:
         found = read(log, columns=job.columns)
@@ -200,51 +216,53 @@ def fill(
             "schema_version": SCHEMA_VERSION,
             "command": "fill",
             "dry_run": True,
-            "log": _about(found),
+            "log": about(found),
             "would_write": outputs,
         }
         if json_:
-            _print_json(plan)
+            print_json(plan)
         else:
-            _words(f"would fill {found!r}", quiet)
+            words(f"would fill {found!r}", quiet)
             for note in found.notes:
-                _words(f"note: {note}", quiet)
+                words(f"note: {note}", quiet)
             for path in outputs:
-                _words(f"would write {path}", quiet)
+                words(f"would write {path}", quiet)
         return cli.GOOD
     started = time.perf_counter()
-    with _working("filling", quiet or no_progress):
+    with working("filling", quiet or no_progress):
         track: Any = run(job)
     command = "halfwidth " + shlex.join(_again())
     # the report first: were the track there and the report not, the run would look finished
-    with _reader():
+    with reader():
         if report is not None:
             track.report(report, command=command)
         if output is not None:
             track.write(output, format=format_)
     if json_:
         written = {"track": output, "report": report}
-        _print_json(_track_json(track, written, command, time.perf_counter() - started))
+        print_json(track_json(track, written, command, time.perf_counter() - started))
     if verbose:
         for note in track.log.notes:
-            _words(f"  {note}", quiet)
+            words(f"  {note}", quiet)
     if not quiet:
         for note in track.log.notes:
             if not verbose and not note.startswith("columns"):
-                _words(f"note: {note}", quiet)
+                words(f"note: {note}", quiet)
         for message in track.messages:
-            _words(f"note: {message}", quiet)
-        _words(track.summary(), quiet)
+            words(f"note: {message}", quiet)
+        words(track.summary(), quiet)
         for path in (output, report):
             if path not in (None, "-"):
-                _words(f"wrote {path}", quiet)
+                words(f"wrote {path}", quiet)
     return cli.GOOD
 
 
 # --- check --------------------------------------------------------------------------------------
 
 
-@app.command(epilog="Example: halfwidth check drive.csv --report check.html")
+@app.command(
+    short_help="Say what is wrong with a log.", epilog="Example: halfwidth check drive.csv --report check.html"
+)
 def check(
     log: LogPath,
     report: Annotated[
@@ -261,23 +279,26 @@ def check(
     from halfwidth.vehicle import read
 
     if report == "-":
-        raise _usage("the page and the words of `check` both claim standard output", "--report check.html")
-    _writable(report, log, force)
+        raise usage("the page and the words of `check` both claim standard output", "--report check.html")
+    writable(report, log, force)
     found = examine(read(log, columns=columns, repair=False))
     if report is not None:
         found.report(report)
-        _words(f"wrote {report}", quiet)
+        words(f"wrote {report}", quiet)
     if json_:
-        _print_json({"command": "check", **found.to_dict()})
+        print_json({"command": "check", **found.to_dict()})
     else:
-        _out(_printable(found.summary()))
+        out(printable(found.summary()))
     return cli.GOOD
 
 
 # --- outages ------------------------------------------------------------------------------------
 
 
-@app.command(epilog="Example: halfwidth outages drive.csv --lengths 1,5,30")
+@app.command(
+    short_help="Compare methods on outages cut into a log.",
+    epilog="Example: halfwidth outages drive.csv --lengths 1,5,30",
+)
 def outages(
     log: LogPath,
     lengths: Annotated[
@@ -301,15 +322,16 @@ def outages(
     from halfwidth.vehicle import outages as benchmark
     from halfwidth.vehicle import read
 
-    wanted = _numbers("--lengths", lengths)
-    _finite("--clock-offset", clock_offset)
+    wanted = numbers("--lengths", lengths)
+    finite("--clock-offset", clock_offset)
     names = [name.strip() for name in methods.split(",") if name.strip()] if methods else None
     for name in names or ():
-        _method_known(name)
+        method_known(name)
     if plot is not None:
-        _writable(plot, log, force)
+        figure_known("--plot", plot)
+        writable(plot, log, force)
     found = read(log, columns=columns)
-    with _working("outages", quiet or no_progress) as progress:
+    with working("outages", quiet or no_progress) as progress:
         result = benchmark(
             found,
             lengths=wanted,
@@ -322,16 +344,16 @@ def outages(
     if plot is not None:
         result.plot().figure.savefig(plot)
     if json_:
-        _print_json({"schema_version": SCHEMA_VERSION, "command": "outages", "log": _about(found), **result.to_dict()})
+        print_json({"schema_version": SCHEMA_VERSION, "command": "outages", "log": about(found), **result.to_dict()})
     else:
-        _out(_printable(result.table()) + "\n")
+        out(printable(result.table()) + "\n")
     return cli.GOOD
 
 
 # --- demo ---------------------------------------------------------------------------------------
 
 
-@app.command(epilog="Example: halfwidth demo -o demo")
+@app.command(short_help="Fill a simulated drive with tunnels.", epilog="Example: halfwidth demo -o demo")
 def demo(
     output: Annotated[
         str, typer.Option("--output", "-o", metavar="FOLDER", help="Where to put log, track and report.")
@@ -348,19 +370,19 @@ def demo(
 
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
-        raise _usage(f"`{output}` is a file, a folder is expected", "-o FOLDER")
+        raise usage(f"`{output}` is a file, a folder is expected", "-o FOLDER")
     held = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     # a demonstration is made anew, so that the same command can be typed twice; anything else is kept
     if held and held != {"drive.csv", "track.gpx", "report.html"} and not force:
-        raise _usage(
+        raise usage(
             f"`{output}` holds other files already", "--force to overwrite them, or -o FOLDER for another place"
         )
-    with _working("demo", quiet or no_progress):
+    with working("demo", quiet or no_progress):
         result = drive.run(folder, seed=seed)
     if json_:
-        _print_json({"schema_version": SCHEMA_VERSION, "command": "demo", **result.to_dict()})
+        print_json({"schema_version": SCHEMA_VERSION, "command": "demo", **result.to_dict()})
     else:
-        _out(_printable(result.summary().rstrip("\n")) + "\n")
+        out(printable(result.summary().rstrip("\n")) + "\n")
     return cli.GOOD
 
 
@@ -394,57 +416,57 @@ def estimate(
     from halfwidth.job import Job, run
 
     if not 0 < level < 1:
-        raise _usage(f"`--level` is {level:g}, a probability between 0 and 1 is expected", "--level 0.9")
+        raise usage(f"`--level` is {level:g}, a probability between 0 and 1 is expected", "--level 0.9")
     if output != "-" and not output.lower().endswith((".csv", ".csv.gz", ".parquet")):
-        raise _usage(f"`{output}` ends in no known format, .csv, .csv.gz or .parquet is expected", "-o states.csv")
+        raise usage(f"`{output}` ends in no known format, .csv, .csv.gz or .parquet is expected", "-o states.csv")
     if model == "-" and data == "-":
-        raise _usage("MODEL.toml and DATA both claim standard input", "give one of them as a file")
-    _estimator_known(method)
-    _writable(output, data, force)
-    spec, settings = _model_file(model)
+        raise usage("MODEL.toml and DATA both claim standard input", "give one of them as a file")
+    estimator_known(method)
+    writable(output, data, force)
+    spec, settings = model_file(model)
     name = settings.pop("name", None)
     name = name if method is None else method
     job = Job("estimate", data, model=spec, method=name, settings=settings, level=level, seed=seed)
-    with _working("estimating", quiet or no_progress):
+    with working("estimating", quiet or no_progress):
         answer: Any = run(job)
     answer.check()
-    table = _states(answer, level, spec.get("time", "t"))
+    table = states(answer, level, spec.get("time", "t"))
     if json_ and output == "-":
         output = ""
     if output:
         from halfwidth.store import atomic_write
 
-        with _reader(), atomic_write(output) as file:
-            file.write(_table_bytes(table, output))
+        with reader(), atomic_write(output) as file:
+            file.write(table_bytes(table, output))
     if json_:
-        _print_json(_estimate_json(answer, level, output or None))
+        print_json(estimate_json(answer, level, output or None))
     if not quiet:
-        _words(answer.summary(level), quiet)
+        words(answer.summary(level), quiet)
         if output not in ("", "-"):
-            _words(f"wrote {output}", quiet)
+            words(f"wrote {output}", quiet)
     return cli.GOOD
 
 
 # --- doctor -------------------------------------------------------------------------------------
 
 
-@app.command()
+@app.command(short_help="Print versions, readers and self-tests.")
 def doctor(json_: Json = False) -> int:
     """Print versions, the core's build, a self-test of the solvers, and the readers there are."""
-    from halfwidth.shells.doctor import examine
+    from halfwidth.shells.doctor import examine, text
 
     found = examine()
     if json_:
-        _print_json({"schema_version": SCHEMA_VERSION, "command": "doctor", **found})
+        print_json({"schema_version": SCHEMA_VERSION, "command": "doctor", **found})
     else:
-        _out(_doctor_text(found))
+        out(text(found))
     return cli.GOOD if found["good"] else cli.INTERNAL
 
 
 # --- reproduce ----------------------------------------------------------------------------------
 
 
-@app.command(epilog="Example: halfwidth reproduce 003 --quick")
+@app.command(short_help="Print a source paper's tables beside ours.", epilog="Example: halfwidth reproduce 003 --quick")
 def reproduce(
     paper: Annotated[str, typer.Argument(metavar="PAPER", help="Number of the paper: 000 to 004.")],
     logs: Annotated[
@@ -458,331 +480,21 @@ def reproduce(
 
     if paper not in papers.PAPERS:
         known = ", ".join(papers.PAPERS)
-        raise _usage(f"`{paper}` is no paper that is reproduced here, one of {known} is expected", "reproduce 003")
+        raise usage(f"`{paper}` is no paper that is reproduced here, one of {known} is expected", "reproduce 003")
     if logs and paper not in papers.ON_LOGS:
-        raise _usage(f"paper {paper} is not about vehicles, a log has no use", f"reproduce {papers.ON_LOGS[-1]} LOG")
+        raise usage(f"paper {paper} is not about vehicles, a log has no use", f"reproduce {papers.ON_LOGS[-1]} LOG")
     found = papers.tables(paper, quick=quick, logs=logs or ())
     if json_:
         tables = [
             {"title": t.title, "header": list(t.header), "rows": [list(r) for r in t.rows], "notes": list(t.notes)}
             for t in found
         ]
-        _print_json({"schema_version": SCHEMA_VERSION, "command": "reproduce", "paper": paper, "tables": tables})
+        print_json({"schema_version": SCHEMA_VERSION, "command": "reproduce", "paper": paper, "tables": tables})
     else:
-        _out("\n\n".join(table.text() for table in found) + "\n")
+        out("\n\n".join(table.text() for table in found) + "\n")
     return cli.GOOD
-
-
-# --- small parts --------------------------------------------------------------------------------
-
-
-def _usage(words: str, hint: str) -> Exception:
-    error: Exception = _UsageError(f"{words}\nhint: {hint}")
-    return error
-
-
-def _finite(flag: str, value: float | None) -> None:
-    if value is not None and not abs(value) < float("inf"):
-        raise _usage(f"`{flag}` is {value}, a finite number of seconds is expected", f"{flag} 0.1")
-
-
-def _numbers(flag: str, text: str) -> list[float]:
-    try:
-        values = [float(part) for part in text.split(",") if part.strip()]
-    except ValueError:
-        values = []
-    if not values or not all(0 < value < float("inf") for value in values):
-        raise _usage(f"`{flag}` is {text!r}, positive numbers with commas in between are expected", f"{flag} 1,5,30")
-    return values
-
-
-def _method_known(name: str | None) -> None:
-    """Refuse a method of the vehicle that is not there before any work is done."""
-    if name is not None:
-        from halfwidth.vehicle.estimators import METHODS
-
-        _one_of(name, list(METHODS))
-
-
-def _estimator_known(name: str | None) -> None:
-    """Refuse an estimator that is not there before any work is done."""
-    if name is not None:
-        from halfwidth.methods import ESTIMATORS
-
-        _one_of(name, list(ESTIMATORS))
-
-
-def _one_of(name: str, known: list[str]) -> None:
-    if name not in known:
-        import difflib
-
-        near = difflib.get_close_matches(name, known, n=1)
-        raise _usage(
-            f"there is no method {name!r}, one of {', '.join(known)} is expected",
-            near[0] if near else "leave it away",
-        )
-
-
-def _ending_known(path: str, format_: str | None) -> None:
-    """Refuse a format that is not there before any work is done."""
-    from halfwidth.vehicle.write import ending
-
-    try:
-        ending(path, format_)
-    except BadValue as error:
-        raise _usage(error.message, error.hint or "-o track.csv") from error
-
-
-def _writable(path: str | None, log: str, force: bool) -> None:
-    """Refuse an output that cannot be written before any work is done."""
-    if path is None or path == "-":
-        return
-    target = Path(path)
-    folder = target.parent
-    try:
-        if os.path.isdir(target):
-            raise _usage(f"`{path}` is a directory, a file is expected", f"-o {path.rstrip('/')}/track.csv")
-        if log != "-" and os.path.exists(target) and os.path.exists(log) and os.path.samefile(target, log):
-            raise _usage(f"`{path}` is the input itself", "give another name, the input is never overwritten")
-        if os.path.isfile(target) and not force:
-            raise _usage(f"`{path}` exists already", "--force overwrites it")
-        if not os.path.isdir(folder):
-            raise _usage(
-                f"`{folder}` is no folder, so `{path}` cannot be written", f"mkdir -p {shlex.quote(str(folder))}"
-            )
-    except OSError as error:
-        raise _usage(
-            f"`{path}` cannot be written: {(error.strerror or str(error)).lower()}", "give another path"
-        ) from error
-
-
-def _out(text: str) -> None:
-    """Write data to standard output."""
-    with _reader():
-        sys.stdout.write(text)
-        sys.stdout.flush()
-
-
-@contextmanager
-def _reader() -> Iterator[None]:
-    """Tell the reader of our output closing it early from a failure."""
-    try:
-        yield
-    except BrokenPipeError as error:
-        raise cli.ReaderGone from error
-
-
-def _words(text: str, quiet: bool) -> None:
-    if not quiet:
-        print(_printable(text), file=sys.stderr)
-
-
-def _printable(text: str) -> str:
-    """Take control characters out of what came from a file, so that a name cannot steer a terminal."""
-    return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
-
-
-def _print_json(data: Mapping[str, Any]) -> None:
-    _out(json.dumps(_plain(data), indent=2, allow_nan=False, ensure_ascii=False) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    """Turn arrays and numbers of any kind into what JSON has; NaN becomes null."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [_plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float):
-        return value if abs(value) < float("inf") else None
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    return str(value)
-
-
-def _about(log: Any) -> dict[str, Any]:
-    return {
-        "source": log.source,
-        "rows": len(log),
-        "length_s": float(log.t[-1] - log.t[0]),
-        "fixes": int(log.fixed.sum()),
-        "gaps": [list(gap) for gap in log.gaps()],
-        "rates_hz": log.rates(),
-        "notes": list(log.notes),
-    }
-
-
-def _track_json(track: Any, written: Mapping[str, str | None], command: str, seconds: float) -> dict[str, Any]:
-    names = ("fix", "bridged", "extrapolated")
-    return {
-        "schema_version": SCHEMA_VERSION,
-        "command": "fill",
-        "typed": command,
-        "seconds": round(seconds, 3),
-        "log": _about(track.log),
-        "method": track.method,
-        "level": track.level,
-        "guarantee": track.guarantee,
-        "rows": {name: int((track.quality == name).sum()) for name in names},
-        "gaps": [
-            {
-                name: getattr(gap, name)
-                for name in ("start", "stop", "duration_s", "distance_m", "max_half_m", "quality")
-            }
-            for gap in track.gaps
-        ],
-        "guaranteed": None
-        if track.proven is None
-        else {"acceleration": track.proven.acceleration, "fix": track.proven.fix, "rests_on": track.proven.words},
-        "settings": dict(track.settings),
-        "messages": list(track.messages),
-        "written": dict(written),
-    }
-
-
-def _estimate_json(answer: Any, level: float, output: str | None) -> dict[str, Any]:
-    lo, hi = answer.interval(level) if answer.spread is not None else (None, None)
-    return {
-        "schema_version": SCHEMA_VERSION,
-        "command": "estimate",
-        "method": answer.method,
-        "status": answer.status.name,
-        "guaranteed": answer.guaranteed,
-        "level": level,
-        "names": list(answer.names),
-        "t": answer.t,
-        "x": answer.x,
-        "lo": lo,
-        "hi": hi,
-        "q": answer.q,
-        "r": answer.r,
-        "Q": answer.Q,
-        "R": answer.R,
-        "theta": answer.theta,
-        "loglik": answer.loglik,
-        "written": output,
-    }
-
-
-def _states(answer: Any, level: float, time_name: str) -> dict[str, Any]:
-    """Lay out the answer as columns: time, states, and their intervals."""
-    names = answer.names or tuple(f"x{k}" for k in range(answer.x.shape[1]))
-    if time_name in names:
-        raise BadValue(
-            f"a state is called {time_name!r} as the time column is, so the answer would lack one of them",
-            hint="other names in `states`",
-        )
-    columns = {time_name: answer.t} | {name: answer.x[:, k] for k, name in enumerate(names)}
-    if answer.spread is not None:
-        lo, hi = answer.interval(level)
-        for k, name in enumerate(names):
-            columns |= {f"{name}_lo": lo[:, k], f"{name}_hi": hi[:, k]}
-    return columns
-
-
-def _table_bytes(columns: Mapping[str, Any], path: str) -> bytes:
-    if path.lower().endswith(".parquet"):
-        from halfwidth.errors import Missing
-
-        try:
-            import pyarrow
-            from pyarrow import parquet
-        except ImportError:
-            raise Missing(
-                "Parquet needs pyarrow, which is not installed", hint="pip install 'halfwidth[formats]'"
-            ) from None
-        sink = pyarrow.BufferOutputStream()
-        parquet.write_table(pyarrow.table(dict(columns)), sink)
-        whole: bytes = sink.getvalue().to_pybytes()
-        return whole
-    import csv
-    import io
-
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    for row in zip(*(values.tolist() for values in columns.values()), strict=True):
-        writer.writerow(["" if value != value else repr(value) for value in row])
-    plain = text.getvalue().encode()
-    if path.lower().endswith(".gz"):
-        import gzip
-
-        return gzip.compress(plain, mtime=0)
-    return plain
-
-
-def _model_file(path: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read a model and its optional table `[method]` from TOML."""
-    import tomllib
-
-    try:
-        raw = sys.stdin.buffer.read(1 << 24) if path == "-" else _small(path)
-        spec = tomllib.loads(raw.decode("utf-8-sig"))
-    except OSError as error:
-        raise BadValue(f"`{path}` cannot be read: {(error.strerror or str(error)).lower()}") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadValue(f"`{path}` is no TOML: {error}", hint="A = [[1, 0.1], [0, 1]]") from error
-    settings = spec.pop("method", {})
-    if isinstance(settings, str):
-        settings = {"name": settings}
-    if not isinstance(settings, dict):
-        raise BadValue(f"the key `method` is {settings!r}, a name or a table with `name` is expected")
-    return spec, dict(settings)
-
-
-def _small(path: str) -> bytes:
-    with open(path, "rb") as file:
-        raw = file.read((1 << 24) + 1)
-    if len(raw) > 1 << 24:
-        raise BadValue(f"`{path}` is longer than 16 MiB, a model is expected")
-    return raw
 
 
 def _again() -> list[str]:
     """Give the arguments as typed."""
     return sys.argv[1:]
-
-
-def _doctor_text(found: Mapping[str, Any]) -> str:
-    lines = [f"halfwidth {found['version']}: {'all good' if found['good'] else 'something is wrong'}", ""]
-    for title in ("platform", "core", "libraries", "self_test", "readers"):
-        lines.append(title.replace("_", " "))
-        lines += [f"  {name:<14}{value}" for name, value in found[title].items()]
-    return "\n".join(lines) + "\n"
-
-
-@contextmanager
-def _working(what: str, quiet: bool) -> Iterator[Callable[[float, str], None] | None]:
-    """Show progress on a terminal while something runs: a clock, or a share where it is known."""
-    terminal = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
-    if quiet or not terminal:
-        yield None
-        return
-    import threading
-
-    started, shown, done = time.monotonic(), [""], threading.Event()
-
-    def draw(share: str) -> None:
-        shown[0] = f"{what} {share}{time.monotonic() - started:.0f} s"
-        print(f"\r{shown[0]:<70}", end="", file=sys.stderr, flush=True)
-
-    latest = [""]
-
-    def progress(share: float, words: str) -> None:
-        latest[0] = f"{100 * share:.0f} %, {words}, "
-
-    def tick() -> None:
-        # short work shows nothing at all
-        while not done.wait(0.5):
-            draw(latest[0])
-
-    thread = threading.Thread(target=tick, daemon=True)
-    thread.start()
-    try:
-        yield progress
-    finally:
-        done.set()
-        thread.join()
-        if shown[0]:
-            print(f"\r{'':<70}\r", end="", file=sys.stderr, flush=True)

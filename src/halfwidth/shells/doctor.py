@@ -3,6 +3,7 @@
 import importlib
 import importlib.metadata
 import platform
+from collections.abc import Mapping
 from typing import Any
 
 #: Libraries by distribution, and whether the package cannot do without.
@@ -102,3 +103,12 @@ def _piqp_test() -> str:
     except Exception as error:
         return f"failed ({type(error).__name__}: {error})"
     return "good" if np.abs(found - 0.5).max() < 1e-6 else f"wrong (0.5 is right, {found!r} came out)"
+
+
+def text(found: Mapping[str, Any]) -> str:
+    """Lay out what `examine` found."""
+    lines = [f"halfwidth {found['version']}: {'all good' if found['good'] else 'something is wrong'}", ""]
+    for title in ("platform", "core", "libraries", "self_test", "readers"):
+        lines.append(title.replace("_", " "))
+        lines += [f"  {name:<14}{value}" for name, value in found[title].items()]
+    return "\n".join(lines) + "\n"

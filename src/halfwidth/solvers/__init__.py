@@ -1,1 +1,1 @@
-"""Solvers, one file a problem class, one adapter a library."""
+"""Solvers: programs, the stock libraries that solve them, answers that are proved (`lp.py`), chains in time."""

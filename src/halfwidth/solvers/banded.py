@@ -9,7 +9,7 @@
 block: the cost of an iteration is linear in T. Three points are on offer: the **optimal** one; the **central** one, a
 point of the central path at a relative gap of 0.3, which estimates states better than any optimum does and costs a
 third; and the **least_squares** start. Whatever the core does not certify (a gap above 1e-8, an infeasible program) is
-asked again of the stock solvers of `halfwidth.solvers.lp`, whose answers are proved; a wrong "optimal" is the one thing
+asked again of the stock solvers, whose answers `halfwidth.solvers.lp` proves; a wrong "optimal" is the one thing
 that must not happen.
 
 References
@@ -29,8 +29,10 @@ from halfwidth.array import Array
 from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.result import Status
-from halfwidth.solvers.lp import HIGHS, PIQP, Claim, Program, Solution, Solver, Verdict
+from halfwidth.solvers.lp import Solution
 from halfwidth.solvers.lp import solve as proved
+from halfwidth.solvers.program import Claim, Program, Solver, Verdict
+from halfwidth.solvers.stock import HIGHS, PIQP
 from halfwidth.spread import Box
 from halfwidth.varying import Varying
 

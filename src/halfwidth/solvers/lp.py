@@ -23,33 +23,32 @@ A point that is nearly optimal is polished first: the equations of the rows and 
 active are solved, and the better point is kept. A small program whose optimum is too flat to
 polish gets the opinion of the next solver, too.
 
-Adding a solver: write a function from a `Program` to a `Claim` and put ``Solver(name, function)``
-into the tuple given to `solve`. Its multipliers follow the sign above: z > 0 prices a row at its
-lower end, z < 0 at its upper end. With ``balanced=False`` it is given the program as it was built,
-in particular `Program.chain`, the time structure that a structured solver exploits and the others
-ignore; it returns None where it does not know the structure. The answer is judged like any other.
+Adding a solver: write a function, as in `stock.py`, from a `Program` to a `Claim` and put
+``Solver(name, function)`` into the tuple given to `solve`. Its multipliers follow the sign above:
+z > 0 prices a row at its lower end, z < 0 at its upper end. With ``balanced=False`` it is given the
+program as it was built, in particular `Program.chain`, the time structure that a structured solver
+exploits and the others ignore; it returns None where it does not know the structure. The answer is
+judged like any other.
 
 References
 ----------
 Farkas certificates and weak duality: Boyd & Vandenberghe (2004), Convex Optimization, 5.5, 5.8.
-Balancing: Ruiz (2001), A scaling algorithm to equilibrate both rows and columns norms in matrices.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from enum import Enum
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from halfwidth.array import Array
-from halfwidth.errors import BadShape, BadValue
+from halfwidth.solvers.program import TINY, TOLERANCE, Claim, Program, Scale, Solver, Verdict
+from halfwidth.solvers.stock import HIGHS, PIQP
 
-TOLERANCE = 1e-7
 REDUCED = 1e-5
 
-# Below this share of its own terms, or of the balanced cost scale, the objective is compared absolutely.
-_FLOOR, _TINY = 1e-6, 1e-9
+# Below this share of its own terms the objective is compared absolutely.
+_FLOOR = 1e-6
 # A row's violation is judged relative to its terms plus this.
 _SMALL = 1e-4
 # Points that polish end below _SHARP; others are compared with the next solver's where there are few rows.
@@ -60,114 +59,6 @@ _NEAR = 1e-3
 _FAR = 1e5
 # A Farkas certificate excludes every x within this many times the program's own size.
 _REACH = 1e12
-
-
-class Verdict(Enum):
-    """What has been proved of a program."""
-
-    OPTIMAL = "optimal"
-    REDUCED = "optimal, but only to reduced accuracy"
-    INFEASIBLE = "infeasible"
-    UNBOUNDED = "unbounded"
-    FAILED = "no solver gave an answer that passed the check"
-
-
-class Scale(NamedTuple):
-    """Powers of two that balance a program: ``x = size col x^``, ``z = cost row z^``."""
-
-    row: Array
-    col: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Program:
-    """``min x'P x / 2 + c'x`` with ``row_lo <= G x <= row_hi`` and ``lo <= x <= hi``.
-
-    Parameters
-    ----------
-    c : (n,) array
-    G : (m, n) scipy.sparse CSR array
-    row_lo, row_hi : (m,) arrays
-        Infinite where a side is free; equal where the row is an equation.
-    lo, hi : (n,) arrays
-    P : (n, n) scipy.sparse array, optional
-        Symmetric positive semidefinite.
-    floor : float
-        Size of the objective below which it counts as 0; its gap is judged relative to itself plus
-        this.
-    chain : object, optional
-        The time structure behind the rows, for solvers that exploit it.
-    scale : Scale, optional
-        Found on construction; `dataclasses.replace` keeps it, so costs and bounds change at no
-        cost.
-
-    Raises
-    ------
-    BadShape, BadValue
-        If sizes differ, a number is NaN, or a cost or coefficient is infinite.
-    """
-
-    c: Array
-    G: Any
-    row_lo: Array
-    row_hi: Array
-    lo: Array
-    hi: Array
-    P: Any = None
-    floor: float = 0.0
-    chain: object = None
-    scale: Scale | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        m, n = self.G.shape
-        for name, size in (("c", n), ("row_lo", m), ("row_hi", m), ("lo", n), ("hi", n)):
-            value = getattr(self, name)
-            if value.shape != (size,):
-                raise BadShape(f"`{name}` has shape {value.shape}, ({size},) was expected from `G`")
-            if np.isnan(value).any():
-                raise BadValue(f"`{name}` holds NaN at entry {int(np.argmax(np.isnan(value)))}")
-        if not (np.isfinite(self.c).all() and np.isfinite(self.G.data).all()):
-            raise BadValue("`c` or `G` holds a number that is not finite")
-        if self.P is not None and self.P.shape != (n, n):
-            raise BadShape(f"`P` has shape {self.P.shape}, ({n}, {n}) was expected from `G`")
-        if self.scale is None:
-            object.__setattr__(self, "scale", _balance(self.G))
-
-    def objective(self, x: Array) -> float:
-        """Return ``x'P x / 2 + c'x``."""
-        quadratic = 0.0 if self.P is None else 0.5 * float(x @ (self.P @ x))
-        return float(self.c @ x) + quadratic
-
-
-@dataclass(frozen=True)
-class Claim:
-    """What a solver says, unchecked.
-
-    Parameters
-    ----------
-    verdict : Verdict
-    x : (n,) array or None
-    z : (m,) array or None
-        Row multipliers, ``c + P x = G'z + d``; of an infeasible program the multipliers of a proof,
-        if known.
-    ray : (n,) array or None
-        Direction of descent of an unbounded program.
-    iterations : int
-    """
-
-    verdict: Verdict
-    x: Array | None = None
-    z: Array | None = None
-    ray: Array | None = None
-    iterations: int = 0
-
-
-class Solver(NamedTuple):
-    """A library behind its adapter."""
-
-    name: str
-    run: Callable[[Program], Claim | None]
-    balanced: bool = True
 
 
 @dataclass(frozen=True)
@@ -309,7 +200,7 @@ def judge(program: Program, x: Array, z: Array) -> tuple[Array, Array, Check]:
         primal = float(0.5 * x @ Px + program.c @ x)
         price = _price(z, program.row_lo, program.row_hi) + _price(d, program.lo, program.hi)
         dual = float(price - 0.5 * x @ Px)
-        unit = max(_TINY, program.floor, _FLOOR * float(np.abs(program.c) @ np.abs(x))) + abs(primal)
+        unit = max(TINY, program.floor, _FLOOR * float(np.abs(program.c) @ np.abs(x))) + abs(primal)
         # What violations are worth to the objective; the optimum may lie far from x along a column without a box.
         worth = float(broken @ np.abs(z)) + float(wrong @ np.abs(x)) + _FAR * _largest(wrong)
         off = abs(primal - dual) + worth
@@ -469,31 +360,6 @@ def _elastic_proof(program: Program, solvers: Sequence[Solver], notes: list[str]
     return _Found(Verdict.INFEASIBLE, None, z, None, f"{found.solver}, elastic", found.iterations)
 
 
-# --- balancing ------------------------------------------------------------------------------------
-
-
-def _balance(G: Any, rounds: int = 8) -> Scale:
-    """Return powers of two that bring the largest entry of every row and column near 1."""
-    import scipy.sparse as sp
-
-    m, n = G.shape
-    if G.nnz == 0:
-        return Scale(np.ones(m), np.ones(n))
-    csr = sp.csr_array(G, copy=True)
-    csr.eliminate_zeros()
-    size = np.log2(np.abs(csr.data))
-    i, j = np.repeat(np.arange(m), np.diff(csr.indptr)), csr.indices
-    by_column = np.argsort(j, kind="stable")
-    rows, row_at = np.unique(i, return_index=True)
-    cols, col_at = np.unique(j[by_column], return_index=True)
-    r, c = np.zeros(m), np.zeros(n)
-    for _ in range(rounds):
-        now = size + r[i] + c[j]
-        r[rows] -= 0.5 * np.maximum.reduceat(now, row_at)
-        c[cols] -= 0.5 * np.maximum.reduceat(now[by_column], col_at)
-    return Scale(np.exp2(np.clip(np.round(r), -500, 500)), np.exp2(np.clip(np.round(c), -500, 500)))
-
-
 class _Scaled:
     """A program beside its balanced twin, whose answers it can be asked for.
 
@@ -531,7 +397,7 @@ class _Scaled:
             lo / size,
             hi / size,
             None if P is None else P / cost,
-            max(_TINY, original.floor / (size * cost)),
+            max(TINY, original.floor / (size * cost)),
             original.chain,
             Scale(np.ones(row.size), np.ones(col.size)),
         )
@@ -651,148 +517,3 @@ def _largest(values: Array) -> float:
 
 def _no_nan(value: float) -> float:
     return value if value == value else float("inf")
-
-
-# --- adapters: one function a library -------------------------------------------------------------
-
-
-def _piqp(program: Program) -> Claim:
-    """Interior point with proximal multipliers: fast on sparse programs, LP and QP alike."""
-    import piqp
-    import scipy.sparse as sp
-
-    m, n = program.G.shape
-    # Fixed variables leave an interior point no interior: they are substituted.
-    fixed = program.lo == program.hi
-    keep = np.flatnonzero(~fixed)
-    base = np.where(fixed, program.lo, 0.0)
-    shift = program.G @ base
-    lo, hi = program.row_lo - shift, program.row_hi - shift
-    equal = program.row_lo == program.row_hi
-    rows = np.flatnonzero((np.isfinite(lo) | np.isfinite(hi)) & ~equal)
-    equations = np.flatnonzero(equal)
-    G = program.G[:, keep] if keep.size < n else program.G
-    P = sp.csc_matrix((keep.size, keep.size))
-    c = program.c[keep]
-    if program.P is not None:
-        c = c + (program.P @ base)[keep]
-        P = sp.csc_matrix(program.P[keep][:, keep])
-
-    solver = piqp.SparseSolver()
-    solver.settings.eps_abs = 1e-10
-    solver.settings.eps_rel = 1e-10
-    solver.settings.eps_duality_gap_abs = 1e-2 * TOLERANCE * max(_TINY, program.floor)
-    solver.settings.eps_duality_gap_rel = 1e-10 if program.P is None else 1e-12
-    solver.setup(
-        P,
-        c,
-        sp.csc_matrix(G[equations]) if equations.size else None,
-        lo[equations] if equations.size else None,
-        sp.csc_matrix(G[rows]) if rows.size else None,
-        lo[rows] if rows.size else None,
-        hi[rows] if rows.size else None,
-        program.lo[keep],
-        program.hi[keep],
-    )
-    status = solver.solve()
-    answer = solver.result
-    x, z = base.copy(), np.zeros(m)
-    x[keep] = answer.x
-    if rows.size:
-        z[rows] = answer.z_l - answer.z_u
-    if equations.size:
-        z[equations] = -answer.y
-    verdict = {
-        piqp.PIQP_SOLVED: Verdict.OPTIMAL,
-        piqp.PIQP_PRIMAL_INFEASIBLE: Verdict.INFEASIBLE,
-        piqp.PIQP_DUAL_INFEASIBLE: Verdict.UNBOUNDED,
-    }.get(status, Verdict.FAILED)
-    return Claim(verdict, x, z, np.where(fixed, 0.0, x), int(answer.info.iter))
-
-
-def highs(*, solver: str = "choose", time_limit: float = 120.0) -> Solver:
-    """Return HiGHS as a solver, the reference: slower than PIQP, with vertices and proofs.
-
-    Parameters
-    ----------
-    solver : {"choose", "simplex", "ipm"}
-    time_limit : float
-        Seconds after which it gives up.
-    """
-
-    def run(program: Program) -> Claim:
-        import highspy
-
-        kind = highspy.HighsModelStatus
-        engine: Any = highspy.Highs()  # type: ignore[no-untyped-call]
-        for option, value in (
-            ("output_flag", False),
-            ("presolve", "off"),  # it prints on stdout, and decides without a proof
-            ("solver", solver),
-            ("threads", 1),
-            ("time_limit", float(time_limit)),
-            ("primal_feasibility_tolerance", 1e-9),
-            ("dual_feasibility_tolerance", 1e-9),
-            ("qp_regularization_value", 1e-10),
-        ):
-            engine.setOptionValue(option, value)
-        engine.passModel(_highs_model(program))
-        engine.run()
-        status = engine.getModelStatus()
-        unproved = (kind.kInfeasible, kind.kUnbounded, kind.kUnboundedOrInfeasible)
-        if status in unproved and program.P is None:
-            # Presolve decides without a proof; the simplex method alone ends with one.
-            engine.setOptionValue("presolve", "off")
-            engine.setOptionValue("solver", "simplex")
-            engine.clearSolver()
-            engine.run()
-            status = engine.getModelStatus()
-        info = engine.getInfo()
-        count = max(0, info.simplex_iteration_count, info.ipm_iteration_count, info.qp_iteration_count)
-        if status == kind.kInfeasible:
-            _, there, ray = engine.getDualRay()
-            return Claim(Verdict.INFEASIBLE, z=np.array(ray) if there else None, iterations=count)
-        if status == kind.kUnbounded:
-            _, there, ray = engine.getPrimalRay()
-            return Claim(Verdict.UNBOUNDED, ray=np.array(ray) if there else None, iterations=count)
-        answer = engine.getSolution()
-        good = status in (kind.kOptimal, kind.kModelEmpty)
-        return Claim(
-            Verdict.OPTIMAL if good else Verdict.FAILED,
-            np.array(answer.col_value),
-            np.array(answer.row_dual),
-            iterations=count,
-        )
-
-    return Solver("highs", run)
-
-
-def _highs_model(program: Program) -> Any:
-    import highspy
-    import scipy.sparse as sp
-
-    m, n = program.G.shape
-    model, lp = highspy.HighsModel(), highspy.HighsLp()
-    lp.num_col_, lp.num_row_ = n, m
-    lp.col_cost_ = program.c
-    lp.col_lower_, lp.col_upper_ = program.lo, program.hi
-    lp.row_lower_, lp.row_upper_ = program.row_lo, program.row_hi
-    lp.a_matrix_.format_ = highspy.MatrixFormat.kRowwise
-    lp.a_matrix_.num_col_, lp.a_matrix_.num_row_ = n, m
-    lp.a_matrix_.start_ = program.G.indptr.astype(np.int32)
-    lp.a_matrix_.index_ = program.G.indices.astype(np.int32)
-    lp.a_matrix_.value_ = program.G.data
-    model.lp_ = lp
-    if program.P is not None:
-        lower = sp.csc_array(sp.tril(program.P))
-        lower.sort_indices()
-        model.hessian_.dim_ = n
-        model.hessian_.format_ = highspy.HessianFormat.kTriangular
-        model.hessian_.start_ = lower.indptr.astype(np.int32)
-        model.hessian_.index_ = lower.indices.astype(np.int32)
-        model.hessian_.value_ = lower.data
-    return model
-
-
-PIQP = Solver("piqp", _piqp)
-HIGHS = highs()

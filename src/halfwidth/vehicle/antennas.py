@@ -32,7 +32,8 @@ from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box
-from halfwidth.trace import Tape, compiled
+from halfwidth.tape import Tape
+from halfwidth.trace import compiled
 from halfwidth.vehicle import models
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path

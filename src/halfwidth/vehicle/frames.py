@@ -73,6 +73,11 @@ class Frame:
         -------
         east, north : (n,) arrays
             Metres.
+
+        Raises
+        ------
+        BadShape
+            If the two differ in shape.
         """
         lat, lon = np.asarray(lat_deg, float), np.asarray(lon_deg, float)
         if lat.shape != lon.shape:

@@ -211,6 +211,11 @@ class Log:
         -------
         Log
             The same log with NaN there; speed, yaw rate and acceleration stay.
+
+        Raises
+        ------
+        BadValue
+            If `t0` is after `t1`.
         """
         if not t0 <= t1:
             raise BadValue(f"`t0` is {t0} s and `t1` is {t1} s, t0 <= t1 is expected")

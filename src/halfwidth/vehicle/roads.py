@@ -67,6 +67,12 @@ class Roads:
     def read(cls, path: str | os.PathLike[str], *, usual: float = USUAL) -> "Roads":
         """Read a GeoJSON file; see `of`.
 
+        Parameters
+        ----------
+        path : str or path
+        usual : float
+            As for `of`.
+
         Raises
         ------
         BadValue
@@ -76,7 +82,8 @@ class Roads:
             with open(path, encoding="utf-8") as file:
                 given = json.load(file)
         except OSError as error:
-            raise BadValue(f"the map `{os.fspath(path)}` cannot be read: {error.strerror}") from error
+            words = (error.strerror or str(error)).lower()
+            raise BadValue(f"the map `{os.fspath(path)}` cannot be read: {words}", hint="check the spelling") from error
         except (UnicodeDecodeError, json.JSONDecodeError) as error:
             raise BadValue(f"the map `{os.fspath(path)}` is no JSON: {error}", hint="a GeoJSON file") from error
         return cls.of(given, usual=usual)

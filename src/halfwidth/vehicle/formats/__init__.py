@@ -73,7 +73,7 @@ def read(
     --------
     >>> import tempfile, pathlib
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "drive.csv"
-    >>> _ = path.write_text("time;Breite;Länge\\n0;52,5045;13,3736\\n1;52,5046;13,3737\\n")
+    >>> _ = path.write_text("time;Breite;Länge\n0;52,5045;13,3736\n1;52,5046;13,3737\n")
     >>> read(path).lat_deg
     array([52.5045, 52.5046])
     """

@@ -321,8 +321,8 @@ def _header(lines: Sequence[str], asked: Mapping[str, str], source: Source) -> _
             f"`{source.name}` has no header line (the first line is numbers), column names are expected",
             hint="put a first line such as t_s,lat_deg,lon_deg,speed_mps",
         )
-    names = widest.names if widest is not None else ()
-    raise layout.unknown_layout(names, ("time", "lat", "lon"), source.name)
+    # which of them are lacking is for the chooser to say
+    return widest if widest is not None else _Header(None, 0, (), "")
 
 
 def _split(lines: Sequence[str], delimiter: str | None) -> list[list[str]]:

@@ -325,7 +325,10 @@ def recognise(
     for key, spec in asked.items():
         role = key if key in ROLES else _ROLE_OF.get(key)
         if role is None or role not in ROLES:
-            raise BadLog(f"`columns` names the role {key!r}, one of {', '.join(ROLES)} is expected")
+            raise BadLog(
+                f"`columns` names the role {key!r}, one of {', '.join(ROLES)} is expected",
+                hint="--columns lat=NAME,lon=NAME",
+            )
         uses[role] = _use_asked(role, spec, names, source)
 
     best: dict[str, tuple[float, Use]] = {}
@@ -377,7 +380,10 @@ def exactly(
     uses = {}
     for role, column in wanted.items():
         if column not in bare:
-            raise BadLog(f"`{source}` has no column {column!r}; found: {_listed(names)}")
+            raise BadLog(
+                f"`{source}` has no column {column!r}; found: {_listed(names)}",
+                hint="`time`, `outputs` and `inputs` of the model name the columns",
+            )
         uses[role] = Use(role, bare.index(column), column)
     return uses, []
 
@@ -403,7 +409,8 @@ def _use_asked(role: str, spec: str, names: Sequence[str], source: str) -> Use:
             if unit is None:
                 raise BadLog(
                     f"`columns` gives the unit {unit_text!r} for {role}, one of"
-                    f" {', '.join(FACTORS[KIND[role]])} is expected"
+                    f" {', '.join(FACTORS[KIND[role]])} is expected",
+                    hint=f"--columns {role}={column}[{next(iter(FACTORS[KIND[role]]))}]",
                 )
         else:
             found = role_of(column)
