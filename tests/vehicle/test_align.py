@@ -247,3 +247,22 @@ def test_real_logs(name, speed, yaw, data):
     assert found.scale == pytest.approx(1, abs=0.03)
     assert abs(found.bias) < 0.005
     assert not found.antenna_observable
+
+
+@pytest.mark.parametrize("late", [0.0, 0.4])
+def test_a_step_of_the_clocks_shows_on_poor_fixes_of_one_a_second(late):
+    # the rough look sees none: the pieces of the drive disagree
+    _, log = simulate_drive(
+        duration=300.0, rate=10.0, fix_rate=1.0, fix_noise=0.6, fix_offset=0.8, outages=((70.0, 85.0),), seed=25
+    )
+    streams = {name: getattr(log, name) for name in ("speed_mps", "yaw_rate_radps")}
+    stepped = {
+        name: np.where(log.t > 160, np.interp(log.t - late, log.t, values), values) for name, values in streams.items()
+    }
+    offsets = calibrated(replace(log, **stepped)).offsets
+    for name in ("speed", "yaw_rate"):
+        assert offsets[name].change == ("step" if late else "")
+        if late:
+            (_, before), (when, after) = offsets[name].at
+            assert when == pytest.approx(160, abs=5)
+            assert before - after == pytest.approx(late, abs=0.12)

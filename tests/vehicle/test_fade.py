@@ -74,7 +74,16 @@ def test_only_the_end_that_fades_is_left_out(drive, backwards):
     assert times.size
     assert ((times <= GAP[0]) == backwards).all()
     assert found.size.max() == pytest.approx(10.0, rel=0.25)
-    assert np.ptp(times) > 6.0  # down to what is felt no more
+    assert np.ptp(np.concatenate((times, grid.t[found.tail]))) > 6.0  # down to what is felt no more
+    # the tail stays, without what is left of the fade
+    assert found.tail.size
+    off = np.hypot(grid.east - drive[0].east, grid.north - drive[0].north)
+    back = found.masked(grid)
+    left = np.hypot(back.east - drive[0].east, back.north - drive[0].north)
+    assert off[found.at].min() > off[found.tail].max()
+    assert left[found.tail].max() < 0.75 * off[found.tail].max()
+    assert back.seen[found.tail].all()
+    assert "put right" in found.words(grid)
 
 
 @pytest.mark.parametrize(("begin", "length"), [(120.4, 30.0), (117.4, 10.0), (80.3, 10.0)])

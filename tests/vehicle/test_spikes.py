@@ -103,3 +103,36 @@ def test_strange_streams_are_not_judged():
         log = Log(t=t, lat_deg=np.full(40, 50.0), lon_deg=np.full(40, 14.0), speed_mps=speed)
         assert len(spikes(log)) == 0
         assert spikes(log).masked(log) is log
+
+
+def slow_speeds(step, seed=8, n=300):
+    """Return speeds of one sample a second that change by some dm/s, in steps."""
+    rng = np.random.default_rng(seed)
+    speed = 12.0 + 6.0 * np.sin(np.arange(n) / 11.0) + np.cumsum(rng.normal(0, 0.05, n))
+    return np.round(speed / step) * step
+
+
+@pytest.mark.parametrize(("step", "n"), [(1e-3, 4), (1e-3, 8), (0.1, 6)])
+def test_a_slow_sensor_that_is_stuck_is_found(step, n):
+    speed = slow_speeds(step)
+    assert not spikes(log_of(speed)).stuck
+    for first in (40, 130, 200):
+        held = speed.copy()
+        held[first : first + n] = held[first - 1]
+        held[first + n :] += np.sign(held[first + n] - held[first]) * 2.5  # it has changed by 2.5 m/s meanwhile
+        (run,) = spikes(log_of(held)).stuck["speed_mps"]
+        assert set(range(first, first + n)) <= set(run.tolist())
+        assert run.size <= n + 2
+
+
+def test_a_slow_sensor_of_coarse_steps_that_repeats_itself_often_is_not_stuck():
+    speed = slow_speeds(1.0)
+    assert (np.diff(speed) == 0).mean() > 0.4
+    assert not spikes(log_of(speed)).stuck
+    speed[100:104] = speed[100]
+    assert not spikes(log_of(speed)).stuck
+
+
+def log_of(speed):
+    n = speed.size
+    return Log(t=np.arange(float(n)), lat_deg=np.full(n, 50.0), lon_deg=np.full(n, 14.0), speed_mps=speed)

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import evidence, reckoning, rolling
+from halfwidth.vehicle.clocks import OBSERVABLE, alike, marginal, offset_of, suspected
 from halfwidth.vehicle.frames import wrapped
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.log import STREAMS, Log
-from halfwidth.vehicle.repair import contradicted_yaw, matched_factor
-from halfwidth.vehicle.rough import WIDEST, Rough
+from halfwidth.vehicle.rough import WIDEST, Rough, cut_of
 from halfwidth.vehicle.sensors import AS_LOGGED, STREAM, Calibration, Offset
+from halfwidth.vehicle.units import contradicted_yaw, matched_factor
 
 Floats = NDArray[np.float64]
 
@@ -32,9 +33,6 @@ PIECE, MOST_PIECES, PAUSE = 150.0, 40, 30.0
 
 #: Fixes that a piece needs, and metres that the car must have moved in it.
 FEWEST, LEAST_WAY = 20, 30.0
-
-#: An offset is observable when its standard deviation is below, s.
-OBSERVABLE = 0.15
 
 #: An antenna off the axle is believed when it is this many standard deviations off, known to this many metres, and the
 #: slow error of the fixes moves by less than this many metres in the time of a turn (10 s).
@@ -45,13 +43,6 @@ STANDING, EDGE, SHORTEST = 0.1, 1.0, 1.0
 
 #: The bias is told every so many seconds.
 KNOT = 30.0
-
-#: A change of a clock is believed if it makes the misfit of the pieces smaller by this much, and is this large, s.
-CHANGE_GAIN, CHANGE_LEAST = 25.0, 0.05
-
-#: The same for a step that the rough look saw; and how much worse one stream may fit with the step of the other than
-#: without: a logger mostly has one clock.
-SEEN_GAIN, SHARED = 9.0, 4.0
 
 #: Rounds with the antenna on the axle, then off it.
 _ROUNDS, _MORE = 12, 6
@@ -86,14 +77,26 @@ def calibrated(log: Log, *, clock_offset: float | None = None) -> Calibration:
     start = {name: Offset(seconds, 0.0, True) for name, seconds in first.items()}
     known = replace(known, still=standstills(log, replace(known, offsets=start)))
     grid = sampled(log)
-    cut = None if given.given else rough.cut()
-    parts = _parts(grid, cut)
+    cut = None if given.given else cut_of(log, known, rough)
     plain = replace(known, offsets={}, still=AS_LOGGED.still)
     streams: reckoning.Streams = {name: plain.stream(log, name) for name in _SENSORS}
     if "speed" not in there:
         streams = {**streams, "speed": _speed_of_fixes(grid)}
-    solved = [_solved(part, streams, known, rough, first, fixed=given.given) for part in parts]
-    pieces = [piece for piece in solved if piece.sound]
+
+    def asked(cut: float | None) -> tuple[list[Grid], list[reckoning.Piece], list[reckoning.Piece]]:
+        parts = _parts(grid, cut)
+        solved = [_solved(part, streams, known, rough, first, fixed=given.given) for part in parts]
+        return parts, solved, [piece for piece in solved if piece.sound]
+
+    parts, solved, pieces = asked(cut)
+    if cut is None and not given.given:
+        which = [1 + _SENSORS.index(name) for name in there]
+        when, gain = suspected(pieces, which)
+        for other in () if when is None else (rough.likeliest(), when):
+            again = () if other is None else asked(other)
+            if again and (cut is None or suspected(again[2], which)[1] > gain):
+                cut, gain = other, suspected(again[2], which)[1]
+                parts, solved, pieces = again
     if not pieces:
         return known
     known = _joined(known, pieces, there, given, cut)
@@ -258,11 +261,11 @@ def _joined(
         for name in there:
             k = 1 + _SENSORS.index(name)
             size = float(sd[k] * max(1.0, spread[k]))
-            offsets[name] = _offset(pieces, k, Offset(float(mean[k]), size, size < OBSERVABLE), cut)
+            offsets[name] = offset_of(pieces, k, Offset(float(mean[k]), size, size < OBSERVABLE), cut)
         stepping = next((one for one in offsets.values() if one.change == "step"), None)
         for name, one in offsets.items():
             if stepping is not None and one.change == "":
-                offsets[name] = _alike(pieces, 1 + _SENSORS.index(name), one, stepping)
+                offsets[name] = alike(pieces, 1 + _SENSORS.index(name), one, stepping)
     bias = np.array([piece.bias.mean() for piece in pieces])
     # a bias drifts: the pieces count by how long they are sure of it, not by how sure
     variance = np.array([piece.bias_sd**2 for piece in pieces])
@@ -313,7 +316,7 @@ def _together(pieces: Sequence[reckoning.Piece]) -> tuple[Floats, Floats, Floats
     prior = np.diag(reckoning.PRIOR**-2.0)
     centre = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
     weight = np.ones(len(pieces))
-    mean, own = centre, np.array([_marginal(piece) for piece in pieces])
+    mean, own = centre, np.array([marginal(piece) for piece in pieces])
     for _ in range(10):
         total = prior + sum(w * piece.information for w, piece in zip(weight, pieces, strict=True))
         moment = prior @ centre + sum(
@@ -326,70 +329,6 @@ def _together(pieces: Sequence[reckoning.Piece]) -> tuple[Floats, Floats, Floats
     squares = np.array([(piece.mean - mean) ** 2 for piece in pieces]) / own**2
     spread = np.sqrt(np.sum(weight[:, None] * squares, axis=0) / max(len(pieces) - 1, 1))
     return mean, sd, spread
-
-
-def _marginal(piece: reckoning.Piece) -> Floats:
-    """Return the standard deviations (5,) of what a piece says by itself, with the prior."""
-    return np.asarray(np.sqrt(np.diag(np.linalg.inv(piece.information + np.diag(reckoning.PRIOR**-2.0)))))
-
-
-def _offset(pieces: Sequence[reckoning.Piece], k: int, constant: Offset, cut: float | None) -> Offset:
-    """Return an offset of one stream: the same for the drive, or stepping or drifting if the pieces say so.
-
-    Few pieces cannot say how much they scatter: they are only asked about a step at `cut`, which the rough look saw.
-    """
-    value = np.array([piece.mean[k] for piece in pieces])
-    own = np.array([_marginal(piece)[k] for piece in pieces])
-    sure = own < 0.5 * reckoning.PRIOR[k]
-    ends = np.array([(piece.t[0], piece.t[-1]) for piece in pieces])[sure]
-    t = np.array([piece.t.mean() for piece in pieces])[sure]
-    seen = cut is not None and bool((t < cut).any() and (t > cut).any())
-    if t.size < 4 and not seen:
-        return constant
-    value, own = value[sure], np.maximum(own[sure], 0.01)
-
-    def misfit(columns: Floats) -> tuple[float, Floats]:
-        found = np.linalg.lstsq(columns / own[:, None], value / own, rcond=None)[0]
-        return float(np.sum(np.minimum(((value - columns @ found) / own) ** 2, 25.0))), found
-
-    ones = np.ones(t.size)
-    flat, _ = misfit(ones[:, None])
-    line, slope = misfit(np.column_stack((ones, t - t.mean())))
-    between = (ends[:-1, 1] + ends[1:, 0]) / 2 if not seen else np.array([cut])
-    tried = [misfit(np.column_stack((t < when, t >= when)).astype(float)) for when in between]
-    best_cut = int(np.argmin([found[0] for found in tried]))
-    step, levels = tried[best_cut]
-    best = step if t.size < 4 else min(line, step)
-    noise = max(1.0, best / max(t.size - 2, 1))
-    if (flat - best) / noise < (SEEN_GAIN if seen else CHANGE_GAIN):
-        return constant
-    if (t.size < 4 or step < line - noise) and abs(levels[1] - levels[0]) > CHANGE_LEAST:
-        when = float(between[best_cut])
-        sides = [float(np.sum(own[side] ** -2.0) ** -0.5) for side in (t < when, t >= when)]
-        at = ((when - 1e-3, float(levels[0])), (when, float(levels[1])))
-        return Offset(constant.seconds, float(max(sides) * np.sqrt(noise)), True, at, "step")
-    if t.size >= 4 and abs(slope[1]) * np.ptp(t) > CHANGE_LEAST:
-        first, last = ((float(x), float(slope[0] + slope[1] * (x - t.mean()))) for x in (ends[0, 0], ends[-1, 1]))
-        return Offset(float(slope[0]), constant.sd, True, (first, last), "drift")
-    return constant
-
-
-def _alike(pieces: Sequence[reckoning.Piece], k: int, constant: Offset, other: Offset) -> Offset:
-    """Return an offset that steps like that of the other stream unless the pieces clearly prefer one that does not."""
-    (_, before), (when, after) = other.at
-    value = np.array([piece.mean[k] for piece in pieces])
-    weight = np.array([_marginal(piece)[k] ** -2.0 for piece in pieces])
-    late = np.where(np.array([piece.t.mean() for piece in pieces]) < when, 0.0, after - before)
-
-    def fitted(value: Floats) -> tuple[float, float]:
-        level = float(weight @ value / weight.sum())
-        return level, float(weight @ (value - level) ** 2)
-
-    level, misfit = fitted(value - late)
-    if misfit > fitted(value)[1] + SHARED:
-        return constant
-    sd = max(float(weight.sum() ** -0.5), other.sd)
-    return Offset(constant.seconds, sd, sd < OBSERVABLE, ((when - 1e-3, level), (when, level + after - before)), "step")
 
 
 def _wheels(

@@ -29,6 +29,8 @@ rotated with the car: a Rauch-Tung-Striebel smoother (the core's) gives the path
 posterior squared residuals (expectation maximisation, Shumway and Stoffer 1982). Each round re-linearises about its
 own path first. Many drives (outages of one log) are solved side by side.
 
+Where a yaw rate is silent for a while its residual has no noise of its own: the yaw rate is what the log's own are
+like, and how it deviates from what is expected between the samples on both sides is one more state (`turning`).
 Without a speed sensor the speed is that of the fixes, with a large variance between them; without a gyro the yaw rate
 is taken as 0 and the scale of the yaw residual learns how much the car turns.
 """
@@ -41,6 +43,7 @@ from numpy.typing import NDArray
 
 from halfwidth import _core
 from halfwidth.result import Status
+from halfwidth.vehicle.chain_rows import Rows, rows_of
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pointing import azimuth_of, with_speed
@@ -63,9 +66,9 @@ LONGITUDINAL, LATERAL, SLIP, YAW, OFFSET, DRIFT, FIX = range(7)
 #: Rows of all drives that are solved side by side at most, but for a single longer drive.
 _BATCH = 20_000
 
-E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS, DRIFT_E, DRIFT_N = range(9)
+E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS, DRIFT_E, DRIFT_N, TURN = range(10)
 
-#: Number of states.
+#: Number of states. Where a yaw rate was silent one more says how it deviates from what is expected; it is not given.
 SIZE = 9
 
 
@@ -188,7 +191,7 @@ def _solved(
     weight: Sequence[Floats | None],
     learn: bool,
 ) -> list[Fit]:
-    rows = _rows(drives)
+    rows = rows_of(drives)
     given = zip(drives, azimuth, strict=True)
     psi = np.concatenate([azimuth_of(drive) if first is None else first for drive, first in given])
     own = zip(drives, weight, strict=True)
@@ -210,71 +213,6 @@ def _solved(
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
-    """All nodes of all drives, one drive below the other; R rows, n drives."""
-
-    offsets: NDArray[np.int64]  # (n + 1,)
-    drive: NDArray[np.int32]  # (R,)
-    first: Mask  # (R,)
-    h: Floats
-    v: Floats
-    w: Floats
-    weight2: Floats  # (R, 4) squared weights of the first four groups
-    extra: Floats  # (R, 3) variance added to longitudinal, lateral and yaw where a sensor was silent
-    gap: Mask  # (R,) whether the step lies in a gap between fixes
-    y: Floats  # (R, 2) fixes, about the first of each drive
-    seen: Mask  # (R, 2)
-    origin: Floats  # (n, 2)
-    far: Floats  # (n,) how far the first node may be from the first fix, m
-
-
-def _rows(drives: Sequence[Grid]) -> _Rows:
-    sizes = np.array([len(drive) for drive in drives])
-    offsets = np.concatenate(([0], np.cumsum(sizes))).astype(np.int64)
-    index = np.repeat(np.arange(len(drives), dtype=np.int32), sizes)
-
-    def joined(name: str) -> Floats:
-        return np.concatenate([getattr(drive, name) for drive in drives])
-
-    h, v, w = joined("h"), joined("speed"), joined("yaw_rate")
-    first = np.zeros(offsets[-1], dtype=bool)
-    first[offsets[:-1]] = True
-    pace = np.abs(v)
-    still = (pace < 0.1) & np.repeat([drive.has_yaw_rate for drive in drives], sizes)
-    weight2 = np.column_stack(
-        (
-            h * np.maximum(np.minimum(1.0, pace), 0.02),
-            h * np.maximum(pace, 0.05) ** 2,
-            h * (pace * w) ** 2,
-            h * np.where(still, 0.01, 1.0),
-        )
-    )
-    # a step of unknown speed may also slide: without this the lateral row would trust a wrong displacement
-    lost_speed, lost_yaw = h * joined("speed_sd"), h * joined("yaw_rate_sd")
-    extra = np.column_stack((lost_speed**2, (0.02 * lost_speed) ** 2, lost_yaw**2))
-    seen = np.concatenate([drive.seen for drive in drives])
-    origin, far = np.zeros((len(drives), 2)), np.zeros(len(drives))
-    for i, drive in enumerate(drives):
-        k = int(np.argmax(drive.seen))
-        origin[i] = drive.east[k], drive.north[k]
-        far[i] = 100.0 + 2.0 * float(np.sum((np.abs(drive.speed) * drive.h)[1 : k + 1]))
-    y = np.column_stack((joined("east"), joined("north"))) - origin[index]
-    y[~seen] = 0.0
-    gap = np.concatenate([in_gap(drive) for drive in drives])
-    return _Rows(offsets, index, first, h, v, w, weight2, extra, gap, y, np.column_stack((seen, seen)), origin, far)
-
-
-def in_gap(drive: Grid) -> Mask:
-    """Return the steps between fixes much further apart than usual, and before the first and after the last."""
-    seen = np.flatnonzero(drive.seen)
-    after = np.searchsorted(seen, np.arange(len(drive)))
-    apart = np.concatenate(([np.inf], np.diff(drive.t[seen]), [np.inf]))
-    usual = float(np.median(apart[1:-1])) if seen.size > 1 else np.inf
-    gap: Mask = apart[after] > 1.5 * usual
-    return gap
-
-
-@dataclass(frozen=True, eq=False)
 class _Line:
     """The linear model about one azimuth: ``z[k] = A z[k-1] + b + w``."""
 
@@ -285,27 +223,31 @@ class _Line:
     half: Floats  # (R,) v h / 2
 
 
-def _linearised(rows: _Rows, psi: Floats) -> _Line:
+def _linearised(rows: Rows, psi: Floats) -> _Line:
     """Solve the residuals for the new state, about the azimuths psi."""
     h, v, w = rows.h, rows.v, rows.w
     middle = psi.copy()
     middle[1:] = 0.5 * (psi[1:] + psi[:-1])
     middle[rows.first] = psi[rows.first]
     S, C, vh = np.sin(middle), np.cos(middle), v * h
-    A = np.zeros((h.size, SIZE, SIZE))
+    size = SIZE + (rows.turn is not None)
+    A = np.zeros((h.size, size, size))
     A[:, range(SIZE), range(SIZE)] = 1.0
     A[:, E, AZIMUTH], A[:, E, SCALE], A[:, E, BIAS] = C * vh, S * vh, 0.5 * C * vh * h
     A[:, N, AZIMUTH], A[:, N, SCALE], A[:, N, BIAS] = -S * vh, C * vh, -0.5 * S * vh * h
     A[:, AZIMUTH, BIAS] = h
+    if rows.turn is not None:
+        A[:, [E, N, AZIMUTH], TURN] = -rows.turn.size[:, None] * A[:, [E, N, AZIMUTH], BIAS]
+        A[:, TURN, TURN] = rows.turn.keep
     aside = vh * (-0.5 * h * w - middle)
-    b = np.zeros((h.size, SIZE))
+    b = np.zeros((h.size, size))
     b[:, E], b[:, N], b[:, AZIMUTH] = C * aside, -S * aside, -h * w
-    A[rows.first] = np.eye(SIZE)
+    A[rows.first] = np.eye(size)
     b[rows.first] = 0.0
     return _Line(A, b, S, C, 0.5 * vh)
 
 
-_OUT = np.zeros((2, SIZE))
+_OUT = np.zeros((2, SIZE + 1))
 _OUT[0, [E, OFFSET_E]] = _OUT[1, [N, OFFSET_N]] = 1.0
 
 
@@ -322,7 +264,7 @@ class _Smoothed:
     code: NDArray[np.int64]  # (n,)
 
 
-def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Chain) -> _Smoothed:
+def _smoothed(rows: Rows, line: _Line, s2: Floats, share: Floats, settings: Chain) -> _Smoothed:
     """Run the smoother of the core over all drives; s2 (n, 7) are squared scales, share (R,) weights of increments."""
     h, n = rows.h, len(rows.origin)
     A = line.A.copy()
@@ -335,7 +277,8 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Cha
     along, aside, yaw = _variances(rows, own)
     # the noise of the rotated residuals, in the axes of the state
     across = aside + line.half**2 * yaw
-    Q = np.zeros((h.size, SIZE, SIZE))
+    size = A.shape[1]
+    Q = np.zeros((h.size, size, size))
     S, C = line.S, line.C
     Q[:, E, E] = S * S * along + C * C * across
     Q[:, N, N] = C * C * along + S * S * across
@@ -347,9 +290,11 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Cha
     Q[:, DRIFT_E, DRIFT_E] = Q[:, DRIFT_N, DRIFT_N] = own[:, DRIFT] * h
     Q[:, SCALE, SCALE] = settings.scale_walk**2 * h
     Q[:, BIAS, BIAS] = settings.bias_walk**2 * h
+    if rows.turn is not None:
+        Q[:, TURN, TURN] = rows.turn.q
     Q[rows.first] = 0.0
     start = rows.offsets[:-1]
-    x0, P0 = np.zeros((n, SIZE)), np.zeros((n, SIZE, SIZE))
+    x0, P0 = np.zeros((n, size)), np.zeros((n, size, size))
     x0[:, SCALE] = 1.0
     x0[:, AZIMUTH] = np.arctan2(S[start], C[start])
     offset, drift = _stationary(s2, settings)
@@ -358,6 +303,8 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Cha
     P0[:, OFFSET_E, OFFSET_E] = P0[:, OFFSET_N, OFFSET_N] = offset
     P0[:, DRIFT_E, DRIFT_E] = P0[:, DRIFT_N, DRIFT_N] = drift
     P0[:, SCALE, SCALE], P0[:, BIAS, BIAS] = settings.scale_sd**2, settings.bias_sd**2
+    if rows.turn is not None:
+        P0[:, TURN, TURN] = 1.0
     # one drive at a time: the sums of the core are kept for each row of Q, so they cannot be shared between drives
     parts = []
     for i in range(n):
@@ -367,7 +314,7 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Cha
                 "smooth",
                 A[part],
                 None,
-                _OUT,
+                _OUT[:, :size],
                 Q[part],
                 s2[i, FIX] * np.eye(2),
                 rows.y[part],
@@ -384,7 +331,7 @@ def _smoothed(rows: _Rows, line: _Line, s2: Floats, share: Floats, settings: Cha
     )
 
 
-def _variances(rows: _Rows, own: Floats) -> tuple[Floats, Floats, Floats]:
+def _variances(rows: Rows, own: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the variances (R,) of the longitudinal, lateral and yaw residuals; own (R, 7) are squared scales."""
     d = own[:, : YAW + 1] * rows.weight2
     return d[:, 0] + rows.extra[:, 0], d[:, LATERAL] + d[:, SLIP] + rows.extra[:, 1], d[:, YAW] + rows.extra[:, 2]
@@ -397,7 +344,7 @@ def _stationary(s2: Floats, settings: Chain) -> tuple[Floats, Floats]:
     return 0.5 * m * s2[..., OFFSET] + drift * m * m * d / (m + d), drift
 
 
-def _squares(rows: _Rows, line: _Line, out: _Smoothed) -> Floats:
+def _squares(rows: Rows, line: _Line, out: _Smoothed) -> Floats:
     """Return posterior squared residuals (R, 6) over their squared weights; of the lateral one before it is shared."""
     W, S, C, c = out.W, line.S, line.C, line.half
     squares = np.empty((rows.h.size, 6))
@@ -417,7 +364,7 @@ def _squares(rows: _Rows, line: _Line, out: _Smoothed) -> Floats:
     return np.maximum(squares, 0.0)
 
 
-def _shares(rows: _Rows, square: Floats, s2: Floats, tail: float) -> Floats:
+def _shares(rows: Rows, square: Floats, s2: Floats, tail: float) -> Floats:
     """Return the weights (R,) of the increments of the offset from their mean squares of an axis."""
     scale = s2[rows.drive, OFFSET]
     share = (tail + 2.0) / (tail + 2.0 * square / scale)
@@ -430,7 +377,7 @@ def _shares(rows: _Rows, square: Floats, s2: Floats, tail: float) -> Floats:
     return np.clip(np.where(rows.gap, usual[rows.drive], np.where(np.isfinite(share), share, 1.0)), 1e-6, 1e6)
 
 
-def _learnt(rows: _Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Floats) -> Floats:
+def _learnt(rows: Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Floats) -> Floats:
     """Return the squared scales (n, 7): means of posterior squared residuals over squared weights.
 
     Rows where a sensor was silent are left out. One pseudo-row at the present value keeps a short drive from learning
@@ -444,7 +391,7 @@ def _learnt(rows: _Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Flo
     for g, sensor in ((LONGITUDINAL, 0), (LATERAL, 1), (SLIP, 1), (YAW, 2), (OFFSET, -1), (DRIFT, -1)):
         keep = ~rows.first & np.isfinite(squares[:, g])
         if sensor >= 0:
-            keep &= rows.extra[:, sensor] == 0
+            keep &= ~rows.unknown[:, sensor]
         of = rows.drive[keep]
         counted = np.ones(of.size)
         value = squares[keep, g]
@@ -460,9 +407,9 @@ def _learnt(rows: _Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Flo
     return np.clip(new, _FLOOR**2, _CEILING**2)
 
 
-def _fit(rows: _Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain) -> Fit:
+def _fit(rows: Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain) -> Fit:
     part = slice(int(rows.offsets[i]), int(rows.offsets[i + 1]))
-    z, P = out.x[part].copy(), out.P[part]
+    z, P = out.x[part, :SIZE].copy(), out.P[part, :SIZE, :SIZE]
     z[:, [E, N]] += rows.origin[i]
     east, north = z[:, E] + z[:, OFFSET_E], z[:, N] + z[:, OFFSET_N]
     variance = np.column_stack([P[:, a, a] + 2 * P[:, a, o] + P[:, o, o] for a, o in ((E, OFFSET_E), (N, OFFSET_N))])
@@ -511,7 +458,7 @@ def learnt_noise(drive: Grid, fit: Fit, settings: Chain = Chain()) -> tuple[Floa
     start : (9,) array
         Variances of the same before the first node; of the position, of how far it may be.
     """
-    rows, s2 = _rows([drive]), fit.sigma[None] ** 2
+    rows, s2 = rows_of([drive]), fit.sigma[None] ** 2
     h, own = rows.h, s2[rows.drive]
     residuals = np.column_stack(_variances(rows, own)) - rows.extra
     walks = np.column_stack((settings.scale_walk**2 * h, settings.bias_walk**2 * h))

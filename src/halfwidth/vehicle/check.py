@@ -20,15 +20,15 @@ from halfwidth.vehicle.align import calibrated, steps_of
 from halfwidth.vehicle.check_sensors import Item as Item
 from halfwidth.vehicle.distrust import NOTHING, Distrust, distrusted
 from halfwidth.vehicle.log import STREAMS, Log
-from halfwidth.vehicle.repair import (
+from halfwidth.vehicle.sensors import Calibration
+from halfwidth.vehicle.spikes import spikes
+from halfwidth.vehicle.stamps import Stamps, delays, restamped
+from halfwidth.vehicle.units import (
     contradicted_convention,
     contradicted_yaw,
     matched_factor,
     swapped_columns,
 )
-from halfwidth.vehicle.sensors import Calibration
-from halfwidth.vehicle.spikes import spikes
-from halfwidth.vehicle.stamps import Stamps, delays, restamped
 
 Floats = NDArray[np.float64]
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import chain
+from halfwidth.vehicle.chain_rows import in_gap
 from halfwidth.vehicle.grid import Grid
 
 Floats = NDArray[np.float64]
@@ -111,7 +112,7 @@ def likely(drives: Sequence[Grid]) -> list[float]:
     if not drives:
         return []
     learnt = chain.solve(drives, JUDGE)
-    gaps = [chain.in_gap(drive) for drive in drives]
+    gaps = [in_gap(drive) for drive in drives]
     weights = [np.where(gap, 1.0, fit.weight) for gap, fit in zip(gaps, learnt, strict=True)]
     fits = chain.solve(
         drives,

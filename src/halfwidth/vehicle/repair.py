@@ -5,8 +5,7 @@ guessing is refused. A unit or sign that the file states is overruled only where
 it beyond doubt, and never where the user stated it.
 """
 
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,8 @@ from halfwidth.vehicle.formats.cells import NO_TIME, seconds
 from halfwidth.vehicle.formats.layout import FACTORS, KIND, ROLES, SEMICIRCLE, Use
 from halfwidth.vehicle.formats.raw import Raw
 from halfwidth.vehicle.log import STREAMS, Log
+from halfwidth.vehicle.rows import Rows, counted
+from halfwidth.vehicle.units import contradicted_convention, contradicted_yaw, matched_factor, misfit, swapped_columns
 
 Floats = NDArray[np.float64]
 
@@ -39,32 +40,8 @@ _MISTAKE = 180 / np.pi
 #: Speed no fix-to-fix step of a car exceeds (m/s), and the distance that fix errors explain (m).
 TOP_SPEED, FIX_SLACK = 100.0, 30.0
 
-#: Time steps beyond this are a clock being set (s).
-_CLOCK_SET = 86_400.0
-
-#: A clock that goes back further than this has been set, not jittered (s).
-_JITTER = 5.0
-
-#: Rows are shuffled if so many go back in time, and if so many come at the usual rate once they are sorted.
-_DISORDER, _REGULAR = 0.3, 0.8
-
 _GPS_EPOCH = 315_964_800
 _LEAP_SECONDS = 18  # GPS minus UTC, unchanged since 2017
-
-#: Speed over fix distance, what it means, and what makes it right: (factor of speed, factor of time).
-SPEED_FACTORS: tuple[tuple[float, str, float, float], ...] = (
-    (3.6, "speed is in km/h", 1 / 3.6, 1.0),
-    (1 / 0.44704, "speed is in mph", 0.44704, 1.0),
-    (3600 / 1852, "speed is in knots", 1852 / 3600, 1.0),
-    (1 / 3.6, "speed is in m/s, not km/h", 3.6, 1.0),
-    (100.0, "speed is in cm/s", 0.01, 1.0),
-    (1e3, "time is in milliseconds", 1.0, 1e-3),
-    (1e6, "time is in microseconds", 1.0, 1e-6),
-    (1e9, "time is in nanoseconds", 1.0, 1e-9),
-)
-
-#: How near (as a logarithm) a factor must be, and how little windows may scatter around it.
-FACTOR_NEAR, FACTOR_SCATTER = 0.06, 0.15
 
 
 def to_log(raw: Raw, *, repair: bool = True) -> Log:
@@ -97,7 +74,7 @@ def to_log(raw: Raw, *, repair: bool = True) -> Log:
     _drop_infinite(streams, notes)
     _drop_invalid(raw, streams, notes)
     _positions(raw, streams, notes)
-    rows = _Rows(raw.source, t, streams, notes)
+    rows = Rows(raw.source, t, streams, notes)
     rows.drop_untimed()
     rows.drop_before_clock_was_set()
     rows.sort()
@@ -118,10 +95,6 @@ def to_log(raw: Raw, *, repair: bool = True) -> Log:
     return replace(log, notes=tuple(notes))
 
 
-def _n(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's' if noun[-1] != 'x' else 'es'}"
-
-
 def _refuse_text(raw: Raw) -> None:
     """Refuse a needed column that is mostly no numbers."""
     for role in ("time", "lat", "lon"):
@@ -140,11 +113,11 @@ def _refuse_text(raw: Raw) -> None:
 def _note_cells(raw: Raw, notes: list[str]) -> None:
     n_comma = sum(tally.n_comma for tally in raw.tallies.values())
     if n_comma:
-        notes.append(f"decimal commas in {_n(n_comma, 'cell')} read as points")
+        notes.append(f"decimal commas in {counted(n_comma, 'cell')} read as points")
     for role, tally in raw.tallies.items():
         if tally.n_text:
             notes.append(
-                f"{_n(tally.n_text, 'cell')} of `{raw.uses[role].column}` are text, left empty"
+                f"{counted(tally.n_text, 'cell')} of `{raw.uses[role].column}` are text, left empty"
                 f" (the first {tally.first_text[:40]!r} in row {tally.first_row})"
             )
 
@@ -160,7 +133,7 @@ def _time(raw: Raw, notes: list[str]) -> tuple[Floats, float | None]:
             clock = stamps[held]
             wraps = np.cumsum(np.concatenate(([0], np.diff(clock) < -43_200 * 10**9)))
             if wraps.size and wraps[-1]:
-                notes.append(f"{_n(int(wraps[-1]), 'midnight')} passed")
+                notes.append(f"{counted(int(wraps[-1]), 'midnight')} passed")
             stamps[held] = clock + wraps * 86_400 * 10**9
             return seconds(stamps)[0], None
         if raw.times.zoneless:
@@ -256,7 +229,7 @@ def _drop_invalid(raw: Raw, streams: dict[str, Floats], notes: list[str]) -> Non
         return
     for name in ("lat_deg", "lon_deg", "alt_m", "azimuth_rad"):
         streams[name] = np.where(bad, np.nan, streams[name])
-    notes.append(f"{_n(int(bad.sum()), 'fix')} marked invalid by `{raw.uses['valid'].column}` dropped")
+    notes.append(f"{counted(int(bad.sum()), 'fix')} marked invalid by `{raw.uses['valid'].column}` dropped")
 
 
 def _positions(raw: Raw, streams: dict[str, Floats], notes: list[str]) -> None:
@@ -265,7 +238,7 @@ def _positions(raw: Raw, streams: dict[str, Floats], notes: list[str]) -> None:
     both = np.isfinite(lat) & np.isfinite(lon)
     alone = int((np.isfinite(lat) ^ np.isfinite(lon)).sum())
     if alone:
-        notes.append(f"{_n(alone, 'row')} with only one of latitude and longitude: position dropped")
+        notes.append(f"{counted(alone, 'row')} with only one of latitude and longitude: position dropped")
     lat, lon = np.where(both, lat, np.nan), np.where(both, lon, np.nan)
     if both.any() and _is_scaled(lat) and _is_scaled(lon):
         lat, lon = lat * 1e-7, lon * 1e-7
@@ -281,12 +254,12 @@ def _positions(raw: Raw, streams: dict[str, Floats], notes: list[str]) -> None:
             notes.append("latitude and longitude were swapped: put right")
     null = (lat == 0) & (lon == 0)
     if null.any():
-        notes.append(f"{_n(int(null.sum()), 'fix')} at latitude 0, longitude 0 dropped")
+        notes.append(f"{counted(int(null.sum()), 'fix')} at latitude 0, longitude 0 dropped")
     off = (np.abs(lat) > 90) | (np.abs(lon) > 360)
     if off.any():
         k = int(np.flatnonzero(off)[0])
         notes.append(
-            f"{_n(int(off.sum()), 'fix')} off the Earth dropped (the first: latitude {lat[k]:.6g},"
+            f"{counted(int(off.sum()), 'fix')} off the Earth dropped (the first: latitude {lat[k]:.6g},"
             f" longitude {lon[k]:.6g})"
         )
     drop = null | off
@@ -322,152 +295,6 @@ def _from_ddmm(values: Floats) -> Floats:
     return out
 
 
-@dataclass
-class _Rows:
-    """The rows while they are put in order of time."""
-
-    source: str
-    t: Floats
-    streams: dict[str, Floats]
-    notes: list[str] = field(default_factory=list)
-
-    def _keep(self, rows: NDArray[Any]) -> None:
-        self.t = self.t[rows]
-        self.streams = {name: values[rows] for name, values in self.streams.items()}
-
-    def drop_untimed(self) -> None:
-        """Drop rows without a time."""
-        held = np.isfinite(self.t)
-        if not held.all():
-            self.notes.append(f"{_n(int((~held).sum()), 'row')} without a time dropped")
-            self._keep(held)
-        if self.t.size == 0:
-            raise BadLog(f"`{self.source}` has no row with a time")
-
-    def drop_before_clock_was_set(self) -> None:
-        """Keep the main block where the clock was set while the log ran."""
-        cuts = np.flatnonzero(np.abs(np.diff(self.t)) > _CLOCK_SET) + 1
-        if cuts.size == 0:
-            return
-        edges = np.concatenate(([0], cuts, [self.t.size]))
-        # blocks of the same clock belong together: a single wild stamp does not split them
-        centre = np.array([np.median(self.t[a:b]) for a, b in pairwise(edges)])
-        size = np.diff(edges)
-        main = centre[int(np.argmax(size))]
-        near = np.abs(centre - main) <= 7 * _CLOCK_SET
-        kept = np.repeat(near, size)
-        if kept.mean() < 0.8:
-            raise BadLog(
-                f"`{self.source}` jumps by {float(np.abs(np.diff(self.t)).max()) / 86400:.3g} days in time and no part"
-                f" holds most of its {self.t.size} rows, one drive is expected",
-                hint="split it where the clock jumps",
-            )
-        if not kept.all():
-            self.notes.append(f"{_n(int((~kept).sum()), 'row')} days away from the rest dropped (clock not set)")
-            self._keep(kept)
-
-    def sort(self) -> None:
-        """Put rows in order of time, unless the clock restarted."""
-        step = np.diff(self.t)
-        back = step < 0
-        if not back.any():
-            return
-        if (step <= 0).all():
-            self._keep(np.arange(self.t.size)[::-1])
-            self.notes.append("rows ran backwards in time: turned around")
-            return
-        restarts = np.flatnonzero(step < -_JITTER) + 1
-        if restarts.size and self._shuffled(back):
-            self._keep(np.argsort(self.t, kind="stable"))
-            self.notes.append("rows stood in no order of time: sorted")
-            return
-        if restarts.size:
-            self._refuse_restart(restarts)
-        order = np.argsort(self.t, kind="stable")
-        self._keep(order)
-        self.notes.append(f"time went backwards {_n(int(back.sum()), 'time')}: rows sorted")
-
-    def _shuffled(self, back: NDArray[np.bool_]) -> bool:
-        """Whether rows of one drive stand in no order: no two share a time, and once sorted they come regularly."""
-        step = np.diff(np.sort(self.t))
-        usual = float(np.median(step))
-        return bool(back.mean() > _DISORDER and step.min() > 0 and np.mean(np.abs(step / usual - 1) < 0.5) > _REGULAR)
-
-    def _refuse_restart(self, restarts: NDArray[Any]) -> None:
-        """Refuse two drives on one clock; streams one after the other, or blocks in disorder, are fine."""
-        if restarts.size > 1000:
-            raise BadLog(
-                f"`{self.source}` goes back in time by more than {_JITTER:g} s in {restarts.size} rows, one clock is"
-                " expected",
-                hint="is it the right column? --columns time=NAME names another",
-            )
-        edges = np.concatenate(([0], restarts, [self.t.size]))
-        for name in ("lat_deg", "speed_mps", "yaw_rate_radps", "ax_mps2"):
-            held = np.isfinite(self.streams[name])
-            spans = []
-            for a, b in pairwise(edges):
-                t = self.t[a:b][held[a:b]]
-                if t.size:
-                    spans.append((float(t.min()), float(t.max()), int(a)))
-            spans.sort()
-            for (_, end, one), (start, _, other) in pairwise(spans):
-                if start < end - _JITTER:
-                    row = max(one, other)
-                    raise BadLog(
-                        f"`{self.source}` restarts its clock: row {row + 1} is at {self.t[row]:.6g} s after"
-                        f" {self.t[row - 1]:.6g} s, and both parts hold {name} for the same times",
-                        hint=f"split it before row {row + 1}: one drive a file",
-                    )
-
-    def spread_coarse_stamps(self) -> None:
-        """Spread rows evenly where many samples share one stamp of a coarse clock."""
-        starts = np.flatnonzero(np.concatenate(([True], np.diff(self.t) > 0)))
-        size = np.diff(np.concatenate((starts, [self.t.size])))
-        if starts.size < 3 or float(np.median(size)) < 2:
-            return
-        group = np.repeat(np.arange(starts.size), size)
-        held = np.isfinite(self.streams["speed_mps"])
-        for name in ("lat_deg", "yaw_rate_radps", "ax_mps2"):
-            other = np.isfinite(self.streams[name])
-            held = other if other.sum() > held.sum() else held
-        # only if the same stream comes several times a stamp: else rows merely share an instant
-        if held.sum() < 1.5 * np.unique(group[held]).size:
-            return
-        usual = float(np.median(np.diff(self.t[starts])))
-        width = np.append(np.minimum(np.diff(self.t[starts]), usual), usual)
-        place = np.arange(self.t.size) - np.repeat(starts, size)
-        share = np.maximum(size, float(np.median(size)))
-        self.t = self.t + np.repeat(width / share, size) * place
-        self.notes.append(
-            f"about {float(np.median(size)):g} rows share each time stamp of {usual:.3g} s: spread evenly in between"
-        )
-
-    def join_equal_times(self) -> None:
-        """Make rows of one time one row: the first value of each stream stays."""
-        new = np.concatenate(([True], np.diff(self.t) > 0))
-        if new.all():
-            return
-        starts = np.flatnonzero(new)
-        rows = np.arange(self.t.size)
-        group = np.cumsum(new) - 1
-        conflict = np.zeros(self.t.size, dtype=bool)
-        lat = self.streams["lat_deg"]
-        joined = {}
-        for name, values in self.streams.items():
-            held = np.isfinite(lat) if name == "lon_deg" else np.isfinite(values)
-            first = np.minimum.reduceat(np.where(held, rows, self.t.size), starts)
-            there = first < self.t.size
-            out = np.full(starts.size, np.nan)
-            out[there] = values[first[there]]
-            joined[name] = out
-            conflict |= held & (values != out[group])
-        self.notes.append(
-            f"{_n(int((~new).sum()), 'row')} with the time of the row before joined to it"
-            + (f", {int(conflict.sum())} of them with other values, which are dropped" if conflict.any() else "")
-        )
-        self.t, self.streams = self.t[starts], joined
-
-
 def _asked(raw: Raw, role: str) -> bool:
     use = raw.uses.get(role)
     return use is not None and use.asked and use.unit is not None
@@ -476,23 +303,6 @@ def _asked(raw: Raw, role: str) -> bool:
 def _stated(raw: Raw, role: str) -> bool:
     use = raw.uses.get(role)
     return use is not None and use.unit is not None
-
-
-def matched_factor(found: evidence.Finding) -> tuple[float, str, float, float] | None:
-    """Name the unit mistake that a ratio of speeds points to, None if it points to none."""
-    if not found.enough or not found.value > 0:
-        return None
-    if found.spread > FACTOR_SCATTER * found.value:
-        return None
-    for row in SPEED_FACTORS:
-        if abs(np.log(found.value / row[0])) < FACTOR_NEAR:
-            return row
-    return None
-
-
-def _off(found: evidence.Finding) -> float:
-    """Return how far a ratio of speeds is from 1, as a logarithm; a speed of zero is far."""
-    return abs(float(np.log(max(found.value, 1e-9))))
 
 
 def _unstated_units(log: Log, raw: Raw, notes: list[str]) -> Log:
@@ -509,7 +319,7 @@ def _unstated_units(log: Log, raw: Raw, notes: list[str]) -> Log:
         factor = SEMICIRCLE / 1e-7
         other = replace(log, lat_deg=log.lat_deg * factor, lon_deg=log.lon_deg * factor)
         given, tried = evidence.speed_ratio(log), evidence.speed_ratio(other)
-        nearer = _off(tried) < 0.05 < _off(given)
+        nearer = misfit(tried) < 0.05 < misfit(given)
         if tried.enough and nearer and tried.spread < given.spread:
             log = other
             notes[notes.index(scaled)] = "latitude and longitude read as semicircles, as the speed says"
@@ -556,52 +366,12 @@ def _contradicted(log: Log, raw: Raw, notes: list[str]) -> Log:
     return log
 
 
-def contradicted_yaw(found: evidence.Turning) -> float | None:
-    """Give the factor that makes the yaw rate fit the courses, None if it fits or nothing is sure."""
-    if not found.enough:
-        return None
-    sign = 1.0 if found.slope > 0 else -1.0
-    for factor in (1.0, np.pi / 180, 180 / np.pi):
-        if abs(np.log(abs(found.slope) / factor)) < 0.7:
-            return None if sign * factor == 1 else sign * factor
-    return None
-
-
-def contradicted_convention(log: Log) -> str | None:
-    """Name the convention of the azimuth if another than ours fits the courses far better."""
-    errors = evidence.course_errors(log)
-    ours = errors["radians clockwise from north"]
-    best = min(errors, key=lambda name: errors[name].value if errors[name].n else np.inf)
-    if not ours.enough or ours.value < 0.5 or errors[best].value > 0.15:
-        return None
-    # a straight drive cannot tell a mirrored azimuth from a right one
-    close = [name for name in errors if errors[name].n and errors[name].value < errors[best].value + 0.1]
-    return best if len(close) == 1 else None
-
-
 def _unswapped(log: Log, notes: list[str]) -> Log:
     """Swap latitude and longitude back where both are on Earth but distances and courses say so."""
     if not swapped_columns(log):
         return log
     notes.append("latitude and longitude were swapped, as speed and course say: put right")
     return replace(log, lat_deg=log.lon_deg, lon_deg=log.lat_deg)
-
-
-def swapped_columns(log: Log) -> bool:
-    """Say whether speed and course fit the fixes only with latitude and longitude swapped."""
-    if not log.fixed.any() or float(np.nanmax(np.abs(log.lon_deg))) > 90:
-        return False
-    given, other = evidence.speed_ratio(log), evidence.speed_ratio(log, swapped=True)
-    fits = other.enough and _off(other) < 0.1 and other.spread < 0.08
-    # swapped degrees stretch one direction only, so ratios scatter with the course
-    stretched = given.enough and given.spread > 2 * other.spread + 0.02
-    name = "radians clockwise from north"
-    course, other_course = evidence.course_errors(log)[name], evidence.course_errors(log, swapped=True)[name]
-    if course.enough and other_course.enough:
-        by_speed = fits and (stretched or _off(given) > 0.2)
-        return course.value > 0.4 and other_course.value < 0.15 and (by_speed or not given.enough)
-    # a wrong scale of the speed looks alike on a straight road: the stretch alone decides
-    return fits and stretched
 
 
 def _limits(log: Log, notes: list[str], room: float) -> Log:
@@ -613,13 +383,14 @@ def _limits(log: Log, notes: list[str], room: float) -> Log:
         if beyond.any():
             k = int(np.flatnonzero(beyond)[0])
             notes.append(
-                f"{_n(int(beyond.sum()), 'value')} of {name} beyond {most * room:g} dropped (the first {values[k]:.6g})"
+                f"{counted(int(beyond.sum()), 'value')} of {name} beyond {most * room:g} dropped"
+                f" (the first {values[k]:.6g})"
             )
             changed[name] = np.where(beyond, np.nan, values)
     azimuth = log.azimuth_rad
     wild = np.abs(azimuth) > 4 * np.pi * room
     if wild.any():
-        notes.append(f"{_n(int(wild.sum()), 'value')} of azimuth_rad beyond two turns dropped")
+        notes.append(f"{counted(int(wild.sum()), 'value')} of azimuth_rad beyond two turns dropped")
         changed["azimuth_rad"] = np.where(wild, np.nan, azimuth)
     return replace(log, **changed) if changed else log
 
@@ -658,7 +429,7 @@ def _held_fixes(log: Log, notes: list[str]) -> Log:
     gone = np.zeros(len(log), dtype=bool)
     gone[rows[blank]] = True
     why = "repeated by the logger" if held else "frozen while the car moved"
-    notes.append(f"{_n(int(blank.sum()), 'fix')} {why}: dropped")
+    notes.append(f"{counted(int(blank.sum()), 'fix')} {why}: dropped")
     changed: dict[str, Any] = {
         name: np.where(gone, np.nan, getattr(log, name)) for name in ("lat_deg", "lon_deg", "alt_m", "azimuth_rad")
     }
@@ -677,7 +448,7 @@ def _impossible(log: Log, notes: list[str]) -> Log:
         return log
     gone = np.zeros(len(log), dtype=bool)
     gone[rows[bad]] = True
-    notes.append(f"{_n(int(bad.sum()), 'fix')} dropped that no car could reach (the first at {t[bad][0]:.6g} s)")
+    notes.append(f"{counted(int(bad.sum()), 'fix')} dropped that no car could reach (the first at {t[bad][0]:.6g} s)")
     changed: dict[str, Any] = {
         name: np.where(gone, np.nan, getattr(log, name)) for name in ("lat_deg", "lon_deg", "alt_m", "azimuth_rad")
     }
@@ -693,7 +464,7 @@ def _enough(log: Log, raw: Raw, notes: list[str]) -> None:
     if lost:
         what += f" after reading ({'; '.join(lost)})"
     raise BadLog(
-        f"`{raw.source}` has {_n(len(log), 'row')} and {what} (`{raw.uses['lat'].column}`,"
+        f"`{raw.source}` has {counted(len(log), 'row')} and {what} (`{raw.uses['lat'].column}`,"
         f" `{raw.uses['lon'].column}`), at least two fixes are expected",
         hint="--columns lat=NAME,lon=NAME names other columns",
     )

@@ -26,6 +26,9 @@ FEWEST = 20
 #: A step of the clocks has so much of the drive on either side, and is looked for at times so far apart, s.
 STEP_SIDE, STEP_APART = 30.0, 1.0
 
+#: Windows of so many seconds are asked for a step.
+SPANS = (1.0, 2.0, 4.0)
+
 #: How long after each other the courses lie that are compared with the yaw rate, s.
 _TURN = 5.0
 
@@ -40,14 +43,14 @@ class Rough:
     span: dict[str, float]  # of each window, s
 
     @classmethod
-    def of(cls, log: Log, known: Calibration) -> "Rough":
-        """Try every offset on the windows of a log whose units are known, its clocks not."""
+    def of(cls, log: Log, known: Calibration, least: float = 1.0) -> "Rough":
+        """Try every offset on the windows, of some seconds, of a log whose units are known, its clocks not."""
         t_fix = log.t[log.fixed]
         usual = float(np.median(np.diff(t_fix)))
         lags = np.arange(-WIDEST, WIDEST + 1e-9, max(0.1, min(usual, 1.0) / 4))
         when, misfit = {}, {}
         plain = replace(known, offsets={})
-        span = max(1.0, usual)
+        span = max(least, usual)
         spans = {"speed": span, "yaw_rate": _TURN}
         chord = evidence.windows(log, span)
         middle, took = 0.5 * (chord.start + chord.stop), chord.stop - chord.start
@@ -96,26 +99,29 @@ class Rough:
         Misfits are taken for Laplace's, as their absolute values are what is minimised, and windows that overlap count
         as one. Both streams are asked together: they mostly come by the same logger.
         """
+        cuts, gain = self._gains()
+        # so many steps were tried that one of them gains this much by chance
+        chance = float(np.log(max(cuts.size, 1) * self.lags.size * len(SPANS)))
+        return _middle(cuts, gain) if gain.max(initial=0.0) > chance else None
+
+    def likeliest(self) -> float | None:
+        """Return when the clocks step if they do, s."""
+        cuts, gain = self._gains()
+        return _middle(cuts, gain) if cuts.size else None
+
+    def _gains(self) -> tuple[Floats, Floats]:
+        """Return times and by how much offsets before and after each explain the drive better than one does."""
         found = [self._likely(name) for name in self.misfit]
         found = [(when, loglik) for when, loglik in found if len(when) >= FEWEST]
         if not found:
-            return None
+            return np.empty(0), np.empty(0)
         first, last = min(when[0] for when, _ in found), max(when[-1] for when, _ in found)
         cuts = np.arange(first + STEP_SIDE, last - STEP_SIDE, STEP_APART)
-        if cuts.size == 0:
-            return None
         gain = np.zeros(cuts.size)
         for when, loglik in found:
             before = loglik[np.searchsorted(when, cuts)]
             gain += before.max(axis=1) + (loglik[-1] - before).max(axis=1) - loglik[-1].max()
-        # so many steps were tried that one of them gains this much by chance
-        if gain.max() <= np.log(cuts.size * self.lags.size):
-            return None
-        # where nothing tells when, as in a gap, the middle is never far off
-        alike = np.flatnonzero(gain > gain.max() - 0.5)
-        same = np.cumsum(np.diff(alike, prepend=alike[0]) > 1)
-        best = same[np.searchsorted(alike, np.argmax(gain))]
-        return float(cuts[alike[same == best]].mean())
+        return cuts, gain
 
     def _likely(self, name: str) -> tuple[Floats, Floats]:
         """Return the times (n,) of the windows of a stream and, for each offset, the log-likelihood up to each."""
@@ -130,6 +136,26 @@ class Rough:
         """Return the times and misfits of the windows in which every offset can be judged."""
         whole = np.isfinite(self.misfit[name]).all(axis=1)
         return self.when[name][whole], _capped(self.misfit[name])
+
+
+def _middle(cuts: Floats, gain: Floats) -> float:
+    """Return the middle of the times about the best one that are as good: where nothing tells, it is never far off."""
+    alike = np.flatnonzero(gain > gain.max() - 0.5)
+    same = np.cumsum(np.diff(alike, prepend=alike[0]) > 1)
+    best = same[np.searchsorted(alike, np.argmax(gain))]
+    return float(cuts[alike[same == best]].mean())
+
+
+def cut_of(log: Log, known: Calibration, rough: Rough) -> float | None:
+    """Return when the clocks step, s, by the shortest windows that tell it; None where one offset explains the drive.
+
+    A speed has changed by more in a longer window, in which the error of the fixes matters less; but there are fewer,
+    and they say less about when.
+    """
+    when = rough.cut()
+    for span in SPANS[1:]:
+        when = Rough.of(log, known, span).cut() if when is None else when
+    return when
 
 
 def _capped(rows: Floats) -> Floats:

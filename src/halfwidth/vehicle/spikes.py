@@ -6,8 +6,10 @@ test of fixes names it. One or two samples are a spike if they are further from 
 can change in that time, and than ten times what is usual. Equal samples for a second or more are stuck if the value
 before or after them leaps: out of a car's reach, or by three times what all but a hundredth of the log's changes are,
 or, where the samples stay equal for three times as long as anywhere else, by more than the log's usual change. A car
-that cruises ends that smoothly. A speed of 0 is never stuck, as a car stands for as long as it likes, and of a leap to
-or from 0 what a sensor may be blind for does not count.
+that cruises ends that smoothly. Shorter runs are stuck too, as those of a slow sensor, where a log has hardly one such
+run with such a leap by chance: as many as there are others, or as follow from how often its samples repeat at all. A
+speed of 0 is never stuck, as a car stands for as long as it likes, and of a leap to or from 0 what a sensor may be
+blind for does not count.
 """
 
 from collections.abc import Mapping
@@ -38,6 +40,10 @@ _STUCK, _STUCK_S = 5, 1.0
 #: A leap is so many times what all but a hundredth of the changes are; where samples stay equal for so many times as
 #: long as anywhere else, so many times the usual change; a log needs so many changes to say what is usual.
 _OFTEN, _LONGER, _MORE, _CHANGES = 3.0, 3.0, 1.5, 50
+
+#: Fewer equal samples, from so many on, are stuck where a log has so few such runs with such a leap by chance; the leap
+#: must be larger than such a share of the changes.
+_FEW, _CHANCE, _LARGE = 3, 0.01, 0.95
 
 #: Below this a sensor may say 0: so much of a leap to or from 0 proves nothing.
 _BLIND = {"speed_mps": 2.0, "yaw_rate_radps": np.inf}
@@ -123,26 +129,49 @@ def spikes(log: Log) -> Spikes:
         if 0 < spike.sum() <= max(1.0, _MANY * rows.size):
             found[name] = rows[spike]
             rows, t, values = rows[~spike], t[~spike], values[~spike]
-        begin = np.flatnonzero(np.concatenate(([True], np.diff(values) != 0)))
-        end = np.concatenate((begin[1:], [values.size])) - 1
-        held = t[end] - t[begin]
-        long = (end - begin + 1 >= _STUCK) & (held >= _STUCK_S)
-        change = np.abs(np.diff(values))
-        still = (values[1:] == 0) | (values[:-1] == 0)
-        leap = np.where(still, np.maximum(change - _BLIND[name], 0.0), change)
-        leap = np.concatenate(([0.0], leap, [0.0]))
-        leap = np.where(values[begin] == 0, 0.0, np.maximum(leap[begin], leap[end + 1]))
-        reach = at_once + rate * float(np.median(np.diff(t)))
-        changes = change[change > 0]
-        if changes.size >= _CHANGES:
-            reach = min(reach, _OFTEN * float(np.quantile(changes, 0.99)))
-            other = np.partition(held[values[begin] != 0], -2)[-2] if np.sum(values[begin] != 0) > 1 else np.inf
-            alone = held > _LONGER * max(other, _STUCK_S)
-            odd = long & ((leap > reach) | (alone & (leap > _MORE * float(np.median(changes)))))
-        else:
-            odd = long & (leap > reach)
-        first, last = begin[odd], end[odd]
-        runs = [rows[a : b + 1] for a, b in zip(first, last, strict=True)]
+        begin, end = _stuck(t, values, at_once + rate * float(np.median(np.diff(t))), _BLIND[name])
+        runs = [rows[a : b + 1] for a, b in zip(begin, end, strict=True)]
         if runs and sum(run.size for run in runs) <= _MANY_STUCK * rows.size:
             stuck[name] = runs
     return Spikes(found, stuck)
+
+
+def _stuck(t: Floats, values: Floats, reach: float, blind: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first and last of each run of equal samples that is stuck; a change beyond reach is out of a car's."""
+    begin = np.flatnonzero(np.concatenate(([True], np.diff(values) != 0)))
+    end = np.concatenate((begin[1:], [values.size])) - 1
+    number, held, moving = end - begin + 1, t[end] - t[begin], values[begin] != 0
+    long = (number >= _STUCK) & (held >= _STUCK_S)
+    change = np.abs(np.diff(values))
+    still = (values[1:] == 0) | (values[:-1] == 0)
+    leap = np.where(still, np.maximum(change - blind, 0.0), change)
+    leap = np.concatenate(([0.0], leap, [0.0]))
+    leap = np.where(moving, np.maximum(leap[begin], leap[end + 1]), 0.0)
+    changes = change[change > 0]
+    if changes.size < _CHANGES:
+        odd = long & (leap > reach)
+        return begin[odd], end[odd]
+    more = _MORE * float(np.median(changes))
+    other = np.partition(held[moving], -2)[-2] if moving.sum() > 1 else np.inf
+    alone = held > _LONGER * max(other, _STUCK_S)
+    odd = long & ((leap > min(reach, _OFTEN * float(np.quantile(changes, 0.99)))) | (alone & (leap > more)))
+    large = float(np.quantile(changes, _LARGE))
+    for k in np.flatnonzero((number >= _FEW) & (held >= _STUCK_S) & (leap > max(more, large)) & ~odd).tolist():
+        odd[k] = _expected(number[moving], int(number[k]), changes, float(leap[k])) < _CHANCE
+    return begin[odd], end[odd]
+
+
+def _expected(number: NDArray[np.intp], n: int, changes: Floats, leap: float) -> float:
+    """Return how many runs of n equal samples with such a leap at an end a log has by chance, one such run apart.
+
+    Runs: as many as there are that long and one more, or, if that is fewer, what comes of how often samples are equal
+    at all and of how often they then stay so. Leaps: as many as there are that large and one more, at both ends.
+    """
+    others = np.delete(number, int(np.argmax(number == n)))
+    samples, equal = float(others.sum() + 1), float((others - 1).sum())
+    again = float(np.maximum(others - 2, 0).sum())
+    share = (equal + 1) / samples
+    # that they stay equal is known from those that were, and before from the share of all
+    stay = (again + share) / (float((others > 1).sum()) + again + 1)
+    runs = min(1.0 + float((others >= n).sum()), samples * share * stay ** (n - 2))
+    return runs * min(1.0, 2.0 * (1.0 + float((changes >= leap).sum() - 1)) / changes.size)

@@ -10,7 +10,9 @@ the fixes are believed: then the reckoning is wrong, or they are all that is kno
 jump contradict each other by more than the fixes are off, and where a jump of the receiver's own slow error explains
 the drive as well (a correction arrives, a satellite is lost): without them the path would be bent all the way through
 the gap. An error that fades (reflections, until enough satellites are back)
-never steps and is easily taken for a drift of the slow error: it is looked for by itself (`fade`).
+never steps and is easily taken for a drift of the slow error: it is looked for by itself (`fade`). Of a fade the fixes
+go that it moves by more than the receiver's own errors would in that time; from its tail what is left of it is taken
+off, so that the other fixes stay.
 """
 
 from collections.abc import Sequence
@@ -20,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import chain
+from halfwidth.vehicle.answers import FEWEST_CONTROLS, Answer, apart_of, furthest, off_path, unusual, wrong_of
 from halfwidth.vehicle.doubts import DOUBTED, Doubt, after_jumps, at_gaps, stretches
 from halfwidth.vehicle.fade import JUDGE, Fade, fades, likely
 from halfwidth.vehicle.grid import Grid
@@ -28,10 +31,6 @@ from halfwidth.vehicle.sensors import Calibration
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-#: A fix is stray if it is this many standard deviations off where it should be, and this far, m. The fixes agree again
-#: once they are this many off, and must do so for this share of the time in doubt.
-FAR, FAR_M, NEAR, AGREED = 4.0, 0.5, 2.0, 0.15
 
 #: What is around doubtful fixes for so long is asked where they should have been, s.
 AROUND = 40.0
@@ -42,9 +41,8 @@ _MOST, _LOOKS, _ROUNDS = 150, 4, 5
 #: Share of what is unusual that is enough for fixes that follow wrong ones: a fault that came fades.
 _AGAIN = 0.5
 
-#: Places where nobody doubts that show what is usual: about so many, and at least; the quantile of how far they are off
-#: that counts, and how many times that a stray fix is off; how many times `FAR` where there are too few such places.
-_CONTROLS, _FEWEST_CONTROLS, _QUANTILE, _MARGIN, _UNKNOWN = 20, 8, 0.75, 1.6, 2.0
+#: Places where nobody doubts that show what is usual: about so many.
+_CONTROLS = 20
 
 #: Scale of what the calibration takes to be without noise.
 _NO_NOISE = 1e-4
@@ -80,18 +78,27 @@ class Strays:
         Nodes.
     size : (n,) array
         How far each fix is off, m.
+    tail : (m,) int array
+        Nodes whose fix has the tail of an error that fades.
+    moved : (m, 2) array
+        By how much these are put right, m east and north.
     """
 
     at: NDArray[np.intp]
     size: Floats
+    tail: NDArray[np.intp]
+    moved: Floats
 
     def masked(self, grid: Grid) -> Grid:
-        """Return the grid without these fixes."""
+        """Return the grid without these fixes, and with tails taken off."""
         if not self.at.size:
             return grid
         hidden = np.zeros(len(grid), dtype=bool)
         hidden[self.at] = True
-        return grid.masked(hidden)
+        east, north = grid.east.copy(), grid.north.copy()
+        east[self.tail] += self.moved[:, 0]
+        north[self.tail] += self.moved[:, 1]
+        return replace(grid, east=east, north=north).masked(hidden)
 
     def words(self, grid: Grid) -> str:
         """Say which fixes go, when they were and how far they are off; empty if none goes."""
@@ -105,12 +112,19 @@ class Strays:
             spans.append(f"{when} s by up to {size.max():.1f} m")
         more = f" and {len(spans) - 5} more" if len(spans) > 5 else ""
         some = "1 fix lies" if self.at.size == 1 else f"{self.at.size} fixes lie"
-        return f"{some} where the vehicle cannot have been and {'is' if self.at.size == 1 else 'are'} left out: " + (
-            ", ".join(spans[:5]) + more
+        tail = ""
+        if self.tail.size:
+            most = float(np.hypot(*self.moved.T).max())
+            tail = f"; as the error fades, {self.tail.size} beside them are put right, by up to {most:.2g} m"
+        return (
+            f"{some} where the vehicle cannot have been and {'is' if self.at.size == 1 else 'are'} left out: "
+            + ", ".join(spans[:5])
+            + more
+            + tail
         )
 
 
-_NONE = Strays(np.empty(0, dtype=np.intp), np.empty(0))
+_NONE = Strays(np.empty(0, dtype=np.intp), np.empty(0), np.empty(0, dtype=np.intp), np.empty((0, 2)))
 
 
 def strays(grid: Grid, sensors: Calibration) -> Strays:
@@ -150,18 +164,9 @@ def strays(grid: Grid, sensors: Calibration) -> Strays:
     near = np.convolve(search.gone[search.seen], np.ones(3), mode="same") > 0
     search.look([doubt for doubt in jumps if not near[doubt.first]][:_MOST])
     at = np.flatnonzero(search.gone)
-    return Strays(at, search.size[at]) if at.size <= 0.3 * search.seen.size else _NONE
-
-
-@dataclass(frozen=True, eq=False)
-class _Answer:
-    """What was said about one doubt at one length."""
-
-    doubt: Doubt
-    length: float
-    nodes: NDArray[np.intp]  # of the doubtful fixes
-    off: list[tuple[Floats, Floats]]  # how far they are off, and the standard deviation of that, for each side asked
-    apart: Floats  # how far what the sides say is apart, 0 where one was asked
+    moved = np.column_stack((search.grid.east - grid.east, search.grid.north - grid.north))
+    tail = np.flatnonzero(moved.any(axis=1) & grid.seen & ~search.gone)
+    return Strays(at, search.size[at], tail, moved[tail]) if at.size <= 0.3 * search.seen.size else _NONE
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,10 +214,10 @@ class _Search:
         clearest: dict[Doubt, _Wrong] = {}
         for answer in self._ask(doubts, DOUBTED):
             doubt, nodes = answer.doubt, answer.nodes
-            if not _wrong(answer, share).any():
+            if not wrong_of(answer, share).any():
                 continue
             usual = self._usual(doubt, answer.length)
-            wrong = _wrong(answer, share * _unusual(usual)) & ~self.gone[nodes]
+            wrong = wrong_of(answer, share * unusual(usual)) & ~self.gone[nodes]
             if wrong.any():
                 distance, sd = answer.off[-1]
                 clear = float((distance / sd)[wrong].max())
@@ -229,22 +234,38 @@ class _Search:
         for _ in range(2):
             found = self._fading([d for d in doubts if self._beside(d).size >= _FEWEST and not self._silent(d)])
             clearest: dict[int, Doubt] = {}
-            for doubt, wrong in found.items():
-                if doubt.gap not in clearest or wrong.clear > found[clearest[doubt.gap]].clear:
+            for doubt, (_, clear) in found.items():
+                if doubt.gap not in clearest or clear > found[clearest[doubt.gap]][1]:
                     clearest[doubt.gap] = doubt
             for doubt in clearest.values():
-                self.size[found[doubt].nodes], self.gone[found[doubt].nodes] = found[doubt].distance, True
+                self._faded(doubt, found[doubt][0])
             doubts = [doubt for doubt in doubts if clearest.get(doubt.gap, doubt) != doubt]
 
-    def _fading(self, doubts: Sequence[Doubt]) -> dict[Doubt, "_Wrong"]:
-        """Find the doubts in which an error that fades explains some fixes best, and those that it is felt in.
+    def _faded(self, doubt: Doubt, fade: Fade) -> None:
+        """Leave out the fixes that a fade moves by more than the receiver's own errors would; take it off the others.
+
+        What the slow error does in the time constant of the fade hides what is left of it.
+        """
+        nodes = self._beside(doubt)
+        since = self._since(doubt, nodes)
+        left = fade.left(since)
+        own = np.hypot(self.noise[chain.FIX], self.noise[chain.OFFSET] * np.sqrt(fade.tau))
+        large = left > max(float(own), _FELT_M)
+        self.size[nodes[large]], self.gone[nodes[large]] = left[large], True
+        self.grid = fade.removed(self.grid, nodes[~large], since[~large])
+
+    def _since(self, doubt: Doubt, nodes: NDArray[np.intp]) -> Floats:
+        """Return how many seconds from the gap nodes are."""
+        return np.asarray(np.abs(self.grid.t[nodes] - self.grid.t[self.seen[doubt.first]]))
+
+    def _fading(self, doubts: Sequence[Doubt]) -> dict[Doubt, tuple[Fade, float]]:
+        """Find the doubts in which an error that fades explains some fixes best, and the logarithm of its odds.
 
         Where reckoning is so many times worse than the chain takes it to be, likelihoods say less by the square of it.
         """
-        t = self.grid.t
         beside = [self._beside(doubt) for doubt in doubts]
         parts = [self._around(doubt, nodes) for doubt, nodes in zip(doubts, beside, strict=True)]
-        since = [np.abs(t[nodes] - t[self.seen[doubt.first]]) for doubt, nodes in zip(doubts, beside, strict=True)]
+        since = [self._since(doubt, nodes) for doubt, nodes in zip(doubts, beside, strict=True)]
         found = fades(
             [self.grid.rows(part).masked(self.gone[part]) for part in parts],
             [nodes - part.start for nodes, part in zip(beside, parts, strict=True)],
@@ -261,11 +282,11 @@ class _Search:
         rival = self._odds(self._clearest(list(hope)))
         better = {}
         for (doubt, (fade, wrong)), less in zip(hope.items(), against, strict=True):
-            times = _unusual(self._usual(doubt, DOUBTED[1]))
+            times = unusual(self._usual(doubt, DOUBTED[1]))
             likely = (fade.gain - less) / times**2 > fade.worth + _RARE
             # of two that are about as likely, the one that leaves nothing behind
             if likely and wrong.clear - less > rival.get(doubt, 0.0) - _RARE:
-                better[doubt] = wrong
+                better[doubt] = fade, wrong.clear
         return better
 
     def _silent(self, doubt: Doubt) -> bool:
@@ -282,7 +303,7 @@ class _Search:
         nodes = self.seen[lo : doubt.first + 1] if doubt.backwards else self.seen[doubt.first : hi]
         return np.asarray(nodes[~self.gone[nodes]])
 
-    def _ask(self, doubts: Sequence[Doubt], lengths: Sequence[float]) -> list[_Answer]:
+    def _ask(self, doubts: Sequence[Doubt], lengths: Sequence[float]) -> list[Answer]:
         """Ask the fixes before, or after, or both, where the doubtful ones should have been."""
         t, seen = self.grid.t[self.seen], self.seen
         asked: list[tuple[Doubt, float, NDArray[np.intp], list[slice]]] = []
@@ -309,8 +330,8 @@ class _Search:
         answers = []
         for doubt, length, nodes, parts in asked:
             said = [next(fits) for _ in parts]
-            off = [_off(self.grid, nodes, part, fit) for part, fit in zip(parts, said, strict=True)]
-            answers.append(_Answer(doubt, length, nodes, off, _apart(nodes, parts, said)))
+            off = [off_path(self.grid, nodes, part, fit) for part, fit in zip(parts, said, strict=True)]
+            answers.append(Answer(doubt, length, nodes, off, apart_of(nodes, parts, said)))
         return answers
 
     def _odds(self, found: dict[Doubt, "_Wrong"]) -> dict[Doubt, float]:
@@ -370,7 +391,7 @@ class _Search:
         fits = chain.solve([hidden[i] for i in able], self.settings, sigma=self.noise, learn=False) if able else []
         found = [0.0] * len(hidden)
         for i, fit in zip(able, fits, strict=True):
-            (own, sd), (other, _) = (np.median(_off(self.grid, nodes, parts[i], fit), axis=1) for nodes in sides[i])
+            (own, sd), (other, _) = (np.median(off_path(self.grid, nodes, parts[i], fit), axis=1) for nodes in sides[i])
             found[i] = max(0.0, 0.5 * float(other**2 - own**2) / float(sd) ** 2)
         return found
 
@@ -395,7 +416,7 @@ class _Search:
             blocks = [(a, b) for a, b in stretches(self.grid, self.seen) if t[b - 1] - t[a] > 2 * room]
             space = sum(float(t[b - 1] - t[a]) - 2 * room for a, b in blocks)
             # on a short drive they overlap, sooner than being too few
-            apart = min(max(length, (t[-1] - t[0]) / _CONTROLS), max(space / (2 * _FEWEST_CONTROLS), 1.0))
+            apart = min(max(length, (t[-1] - t[0]) / _CONTROLS), max(space / (2 * FEWEST_CONTROLS), 1.0))
             for a, b in blocks:
                 times = np.arange(t[a] + room, t[b - 1] - room, apart)
                 firsts = np.searchsorted(t, times)
@@ -404,7 +425,7 @@ class _Search:
                     for k in firsts
                     if not self.gone[self.seen[k]]
                 ]
-            self._asked[kind] = np.array([_most(one) for one in self._ask(controls, (length,))])
+            self._asked[kind] = np.array([furthest(one) for one in self._ask(controls, (length,))])
         return self._asked[kind]
 
 
@@ -419,57 +440,3 @@ def _put_back(drive: Grid, own: NDArray[np.intp], path: Path) -> Grid:
     east, north = drive.east.copy(), drive.north.copy()
     east[own], north[own] = east[own] - smooth[:, 0], north[own] - smooth[:, 1]
     return replace(drive, east=east, north=north)
-
-
-def _most(answer: _Answer) -> float:
-    """Return how many standard deviations the furthest of the fixes is off, by the side that says the least."""
-    return float(np.min([distance / sd for distance, sd in answer.off], axis=0).max())
-
-
-def _unusual(usual: Floats) -> float:
-    """Return how many times further off than `FAR` fixes must be, from how far off others are."""
-    enough = usual.size >= _FEWEST_CONTROLS
-    return max(1.0, _MARGIN * float(np.quantile(usual, _QUANTILE)) / FAR if enough else _UNKNOWN)
-
-
-def _apart(nodes: NDArray[np.intp], parts: Sequence[slice], fits: Sequence[chain.Fit]) -> Floats:
-    """Return how far the first and the last of some paths are apart at some nodes, m."""
-    first, last = (
-        np.column_stack((fit.path.east, fit.path.north))[nodes - part.start]
-        for fit, part in ((fits[0], parts[0]), (fits[-1], parts[-1]))
-    )
-    return np.asarray(np.nan_to_num(np.hypot(*(last - first).T), nan=np.inf))
-
-
-def _off(grid: Grid, nodes: NDArray[np.intp], part: slice, fit: chain.Fit) -> tuple[Floats, Floats]:
-    """Return how far the fixes at some nodes are off a path, and the standard deviation of that, m."""
-    path, own = fit.path, nodes - part.start
-    if not path.finite or path.variance is None or not path.status.good:
-        return np.zeros(nodes.size), np.ones(nodes.size)
-    distance = np.hypot(path.east[own] - grid.east[nodes], path.north[own] - grid.north[nodes])
-    return distance, np.sqrt(path.variance[own].mean(axis=1) + path.fix_variance)
-
-
-def _wrong(answer: _Answer, times: float) -> Mask:
-    """Return which of the doubted fixes are wrong: from the first on, up to where they agree again.
-
-    They are wrong if all that were asked say so, by so many times the usual; the last one asked says where they agree.
-    Where the sides contradict each other more than the fixes, it is the reckoning that is wrong.
-    """
-    far = np.all(
-        [(distance > times * FAR * sd) & (distance > np.maximum(FAR_M, answer.apart)) for distance, sd in answer.off],
-        axis=0,
-    )
-    distance, sd = answer.off[-1]
-    near = distance < np.maximum(times * NEAR * sd, FAR_M)
-    if answer.doubt.backwards:
-        far, near = far[::-1], near[::-1]
-    wrong = np.zeros(far.size, dtype=bool)
-    if far.any():
-        again = int(np.flatnonzero(far)[-1]) + 1
-        again += int(np.argmax(near[again:])) if near[again:].any() else far.size
-        agreed = near[again:]
-        # where they do not agree again for a while, or most before that do, it is no fault that came and went
-        if agreed.size >= max(1, AGREED * far.size) and agreed.mean() > 0.8 and (~near[:again]).mean() > 0.5:
-            wrong[:again] = ~near[:again] | far[:again]
-    return wrong[::-1] if answer.doubt.backwards else wrong

@@ -1,0 +1,70 @@
+"""Times that a coarse clock hid: the regular ones where they exist, else spread, and never invented."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from tests.vehicle.known import known
+
+from halfwidth.vehicle import simulate_drive
+from halfwidth.vehicle.align import calibrated
+from halfwidth.vehicle.formats import from_frame
+from halfwidth.vehicle.grid import sampled
+from halfwidth.vehicle.rows import ruled_times
+from halfwidth.vehicle.stamps import restamped
+from halfwidth.vehicle.stray import strays
+
+
+@pytest.mark.parametrize("period", [0.05, 0.1013, 0.25, 0.5, 0.497, 1.013, 0.97, 1.9])
+@pytest.mark.parametrize("first", [0.0, 0.37, 0.99])
+def test_regular_rows_are_found_to_what_the_stamps_leave_open(period, first):
+    t = first + period * np.arange(400)
+    t[200:] += 40.0  # a pause
+    found = ruled_times(np.floor(t))
+    assert found is not None
+    assert (np.diff(found) > 0).all()
+    assert ((found > np.floor(t) - 0.03) & (found < np.floor(t) + 1.03)).all()
+    # how far a line may be shifted within all stamps is what the phases of the rows leave
+    phases = np.sort(np.mod(t[:200], 1.0))
+    room = np.diff(np.concatenate((phases, phases[:1] + 1))).max()
+    assert np.ptp((found - t)[:200]) < 0.17
+    assert np.abs(found - t).max() < max(1.1 * room, 0.2)
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2, 12])
+def test_lost_rows_of_an_exact_clock_are_no_slow_clock(lost):
+    keep = np.ones(300, dtype=bool)
+    keep[np.random.default_rng(lost).choice(300, lost, replace=False)] = False
+    assert ruled_times(np.arange(300.0)[keep]) is None
+
+
+def test_strange_stamps_are_left():
+    for stamps in (np.zeros(5), np.zeros(100), np.arange(3.0), np.cumsum(np.random.default_rng(1).uniform(0, 1, 200))):
+        assert ruled_times(stamps) is None
+
+
+def test_what_is_missing_in_the_first_second_is_its_beginning():
+    made = known(60.0, rate=10.0)
+    t = made.log.t + 0.37
+    keep = np.random.default_rng(2).uniform(size=t.size) > 0.05
+    table = {"time": np.floor(t), "lat": made.log.lat_deg, "lon": made.log.lon_deg, "speed": made.log.speed_mps}
+    log = from_frame(pd.DataFrame(table)[keep])
+    off = log.t - t[keep]
+    off -= np.median(off)
+    assert np.abs(off[:3]).max() < 0.2  # was 0.4: the rows began with the second
+    assert off.std() < 0.04
+
+
+@pytest.mark.parametrize("every", [1.013, 0.985])
+def test_fixes_of_a_clock_of_whole_seconds_are_not_left_out(every):
+    _, log = simulate_drive(duration=240.0, outages=((90.0, 110.0),), rate=1.0, fix_rate=1.0, fix_noise=0.1, seed=3)
+    t = every * log.t + 0.37
+    columns = {"time": np.floor(t), "lat": log.lat_deg, "lon": log.lon_deg}
+    columns |= {"speed": log.speed_mps / every, "yaw_rate": log.yaw_rate_radps / every}
+    read = from_frame(pd.DataFrame(columns))
+    assert len(read) == len(log)
+    assert any("coarse" in note or "counts" in note for note in read.notes)
+    assert np.std(read.t - t) < 0.02
+    same, stamps = restamped(read)
+    assert not stamps.moved
+    sensors = calibrated(same)
+    assert not strays(sampled(same, sensors=sensors), sensors).at.size
