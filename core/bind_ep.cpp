@@ -507,6 +507,7 @@ class EpFrame {
         found.add("s", {groups}, &mode);
         found.add("told", {groups * (groups + 2)}, &told);
         found.add("mode", {q_}, &l.mode);
+        l.next = handed.mode;
         found.add("H", {q_, q_}, &l.H);
         found.add("phi", {nodes, q_}, &l.phi);
         found.add("log_weight", {nodes}, &l.log_weight);
@@ -568,7 +569,6 @@ class EpFrame {
         handed.log_prior = found.log_prior;
         handed.log_mode = found.log_mode;
         handed.since = found.since;
-        std::copy(l.mode, l.mode + q_, handed.mode);
         std::copy(l.H, l.H + q_ * q_, handed.H);
         return nb::make_tuple(made, on);
     }

@@ -84,7 +84,7 @@ struct EpLearnArgs {
     const double *floor, *cap, *scale;       // (groups,): bounds, and the order of size
     const double* start;                     // (groups,): first guess, and the half-widths that `before` belongs to
     const EpBefore* before;                  // sites to start from; or null
-    int again;                               // windows that may take over the mode of the one before, one after the other
+    int again;                               // windows that may go without a search for their mode, one after the other
     int shaped;                              // first stage whose skewness and kurtosis are asked for
     const double* count;                     // (groups,): rows of each
     bool learn_eps;
@@ -100,6 +100,7 @@ struct EpLearnArgs {
     const double* z;                         // (nodes, q): standard normal
     // found
     double *mode, *H, *phi, *log_weight;     // (q,), (q,q), (nodes,q), (nodes,)
+    double* next;                            // (q,): the centre of nodes that the window after may begin with
     double *node_slope, *second;             // (nodes,q): d log Z / d phi at each node; (nodes,) what log Z lacks there
     double *value, *share, *residuals;       // (nodes,): log posterior, weight, disagreement of moments
     double *x, *P, *k3, *k4, *centre, *out;  // (T+1,n), (T+1,n,n), ...: of the mixture; out (rows,) or null

@@ -406,14 +406,9 @@ struct EpLearner {
         return q == 0 || wide < a.narrow || a.nodes == 1;
     }
 
-    // a step d from phi of slope g to the mode, by the quadratic that led to it; the kept sites follow
-    void go(double* phi, const double* d, const double* g, double* best) {
+    // the kept sites follow their parameters a step d
+    void draw(const double* d) {
         const std::ptrdiff_t stages = stage_count(), sites = stages + a.base.rows;
-        for (int j = 0; j < q; j++) {
-            const double told_slope = group[j] >= 0 ? 2.0 * a.reference * (1.0 - told(j, 0)) : 0.0;
-            *a.log_prior += (prior_slope(j, phi) + told_slope) * d[j];
-            *best += 0.5 * g[j] * d[j];
-        }
         for (std::ptrdiff_t site = 0; site < sites; site++) {
             const std::ptrdiff_t k = site - stages;
             double &own = k < 0 ? keep_D[site] : keep_tau[k], &first = k < 0 ? keep_m[site] : keep_nu[k], turn = 0.0, move = 0.0;
@@ -426,7 +421,17 @@ struct EpLearner {
             own *= std::exp(k < 0 ? -turn : turn);
             first = k < 0 ? mean : own * mean;
         }
-        for (int j = 0; j < q; j++) kept[j] = phi[j] += d[j];
+        for (int j = 0; j < q; j++) kept[j] += d[j];
+    }
+    // a step d from phi of slope g to the mode, by the quadratic that led to it
+    void go(double* phi, const double* d, const double* g, double* best) {
+        for (int j = 0; j < q; j++) {
+            const double told_slope = group[j] >= 0 ? 2.0 * a.reference * (1.0 - told(j, 0)) : 0.0;
+            *a.log_prior += (prior_slope(j, phi) + told_slope) * d[j];
+            *best += 0.5 * g[j] * d[j];
+            phi[j] += d[j];
+        }
+        draw(d);
     }
 
     // climb from phi to the mode, whose last step of at most `sure` is not looked back from; H at the end; returns 0, 1: not
@@ -694,13 +699,19 @@ struct EpLearner {
         }
     }
 
-    // Whether the nodes lie where the posterior is: its mean near their first centre, and not the weight of a few.
-    bool central(int count, const double* mode, const double (*H)[ep_free], double effective) const {
+    // The centre of the window after's nodes: that of these, moved to their mean where that lies too far. Whether it is to
+    // be trusted: not the weight of a few.
+    bool next_centre(int count, const double* mode, const double (*H)[ep_free], double effective) const {
+        double mean[ep_free] = {};
+        bool near = true;
         for (int j = 0; j < q; j++) {
-            double mean = 0.0;
             for (int k = 0; k < count; k++)
-                if (a.share[k] > 0.0) mean += a.share[k] * place_of(j, a.phi[k * q + j], mode[j]);
-            if (!(std::fabs(mean) * std::sqrt(H[j][j]) < a.near)) return false;
+                if (a.share[k] > 0.0) mean[j] += a.share[k] * place_of(j, a.phi[k * q + j], mode[j]);
+            near = near && std::fabs(mean[j]) * std::sqrt(H[j][j]) < a.near;
+        }
+        for (int j = 0; j < q; j++) {
+            const double d = group[j] < 0 ? mean[j] : std::log(max2(1.0 + a.warp * mean[j], 0.1)) / a.warp;
+            a.next[j] = near ? mode[j] : min2(max2(mode[j] + d, lo[j]), hi[j]);
         }
         return effective > 3.0;
     }
@@ -743,11 +754,14 @@ struct EpLearner {
         int code = 0;
         const bool again = q > 0 && warm && a.before->lanes && a.before->since < a.again && a.before->drop <= ep_few &&
                            b.T - a.before->common <= ep_few;
-        if (again) {  // where the nodes of the window before were
+        if (again) {  // about where the nodes of the window before were
+            double d[ep_free];
             for (int j = 0; j < q; j++) {
                 phi[j] = min2(max2(a.before->mode[j], lo[j]), hi[j]);
                 for (int i = 0; i < q; i++) H[j][i] = a.before->H[j * q + i];
+                d[j] = phi[j] - kept[j];
             }
+            draw(d);
             best = a.before->log_mode;  // in log s already
             *a.log_prior = a.before->log_prior;
         } else if (q > 0) {
@@ -774,7 +788,7 @@ struct EpLearner {
         if (q > 0)
             for (double keep = 1.0; !factor(H, keep, L); keep *= 0.7) {}
         for (int j = 0; j < q; j++) {
-            a.mode[j] = phi[j];
+            a.mode[j] = a.next[j] = phi[j];
             for (int i = 0; i < q; i++) a.H[j * q + i] = H[j][i];
         }
         // sites of the mode, for a warm start
@@ -852,7 +866,7 @@ struct EpLearner {
         *a.log_evidence = log_sum + (nodes > 1 ? -std::log(static_cast<double>(done)) : 0.5 * q * log_2pi) - half_log_det;
         *a.sweeps_used = sweeps;
         *a.since = again ? a.before->since + 1 : 0;
-        if (nodes == 1 || !central(done, phi, H, effective)) *a.since = a.again;
+        if (!next_centre(done, phi, H, effective) || nodes == 1) *a.since = a.again;
         return code;
     }
 };

@@ -9,6 +9,7 @@ import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -166,7 +167,7 @@ class Linear:
         found = {"A": self.A, "B": self.B, "C": self.C, "E": self.E, "F": self.F}
         return {name: matrix for name, matrix in found.items() if matrix is not None}
 
-    @property
+    @cached_property
     def theta_entries(self) -> tuple[Entry, ...]:
         """Unknown entries of the constant matrices, in the order A, B, C, E, F, row by row."""
         return tuple(
