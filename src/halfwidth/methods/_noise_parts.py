@@ -23,10 +23,9 @@ def unknowns(model: Model) -> int:
     """Return how many half-widths and variances of a model are to be found."""
     count = 0
     for noise, n in ((model.w, model.nx), (model.e, model.ny)):
-        box, part = uniform_part(noise), gaussian_part(noise)
-        ends = [] if box is None else [np.array([np.broadcast_to(v, n) for v in (box.at_least, box.at_most)])]
-        for lo, hi in [*ends, ends_of(part, n)]:
-            count += int(np.count_nonzero(lo < hi))
+        for part in (uniform_part(noise), gaussian_part(noise)):
+            if part is not None and part.at_least is not None and part.at_most is not None:
+                count += np.count_nonzero(np.less(part.at_least, part.at_most, out=np.empty(n, dtype=bool)))
     return count
 
 
