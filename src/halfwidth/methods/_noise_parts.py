@@ -25,7 +25,8 @@ def unknowns(model: Model) -> int:
     for noise, n in ((model.w, model.nx), (model.e, model.ny)):
         for part in (uniform_part(noise), gaussian_part(noise)):
             if part is not None and part.at_least is not None and part.at_most is not None:
-                count += np.count_nonzero(np.less(part.at_least, part.at_most, out=np.empty(n, dtype=bool)))
+                apart = np.less(part.at_least, part.at_most, out=np.empty(n, dtype=bool))
+                count += int(np.count_nonzero(apart))
     return count
 
 
