@@ -56,8 +56,8 @@ _STAGE, _STAGES = 16, 8
 WARP = 0.5
 #: Numbers that the beliefs of all nodes may take up; one stage is always had.
 _ROOM = 4e6
-#: Of the search and the nodes. The mode of the window before is a good centre of nodes up to the distance `near`, in
-#: standard deviations.
+#: Of the search and the nodes. A window's nodes lie about the centre that the window before handed on: its own, or the
+#: mean of its nodes where that lies further off than `near`, in standard deviations.
 _LIMITS = {
     "steps": 14, "few": 2, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 2e-2, "close": 0.05, "near": 0.8,
     "least": 2.0, "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
@@ -68,7 +68,8 @@ _LIMITS = {
 _LONG = 2000
 _FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
-#: A window takes over the mode and the nodes of the one before, at most so often in a row and in an eighth of its rows.
+#: A window takes over centre and nodes of the one before, where it would search for its mode, at most so often in a row
+#: and in an eighth of its rows.
 _AGAIN = 4
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
@@ -93,8 +94,7 @@ class Posterior:
     nodes : int
         Most points over which unknown half-widths are integrated: no more are taken than what is left in doubt asks
         for, and no fewer than six and two for each unknown. With five half-widths of 26 rows 32 leave the means .05
-        standard deviations off on average, 128 a tenth of that for twice the time. 1 takes their mode as if it were the
-        truth.
+        standard deviations off on average, 128 a seventh of that. 1 takes their mode as if it were the truth.
     outliers : float or bool
         Share of outputs that are outliers, whose noise is ten half-widths wide; True learns it. Each output noise needs
         a bounded part.
