@@ -29,6 +29,7 @@
 #include "lane.hpp"
 #include "noise.hpp"
 
+#define HW_INLINE inline __attribute__((always_inline))
 namespace hw {
 namespace HW_ISA {
 
@@ -335,7 +336,7 @@ struct Ep {
     }
 
     // Lambda, eta: the future's message and the rows of t
-    inline void ahead(int t, V* Lambda, V* eta) const {
+    HW_INLINE void ahead(int t, V* Lambda, V* eta) const {
         const V* Lb = s.Lb + t * packed();
         for (int i = 0; i < n; i++)
             for (int j = 0; j <= i; j++) Lambda[i * n + j] = Lb[tri(i, j)];
@@ -399,7 +400,7 @@ struct Ep {
     }
 
     // residual z, its variance v and covariance Ph with x_t, of row k in a belief
-    inline void project(int k, const V* ms, const V* Ps, V* Ph, V* z, V* v) const {
+    HW_INLINE void project(int k, const V* ms, const V* Ps, V* Ph, V* z, V* v) const {
         if (const int i = s.axis[k]; i >= 0) {
             *z = ms[i] - target(k);
             *v = Ps[i * n + i];
@@ -433,13 +434,12 @@ struct Ep {
     // other, unless they have two explanations.
     template <bool renew>
     inline void rows(int t, V* ms, V* Ps, V* mf, V* Pf, EpFound& f, double damping) {
-        for (int first = a.start[t], last; first < a.start[t + 1]; first = last) {
-            last = first + 1;
-            while (single(first) && last < a.start[t + 1] && last - first < abreast && single(last)) last++;
+        const int end = a.start[t + 1];
+        for (int k = a.start[t]; k < end;) {
+            const int from = k;
             V Ph[abreast][cap], z[abreast], v[abreast];
-            Cavity<X> cavity[abreast];
             int says[abreast], count = 0;
-            for (int k = first; k < last; k++) {
+            for (; k < end && k < from + abreast && (k == from || (single(k) && single(from))); k++) {
                 if constexpr (!renew) {
                     f.top += densest(k);
                     if (bent(t)) cross.r3[k] = cross.r4[k] = V(0.0);
@@ -449,54 +449,45 @@ struct Ep {
                         if (a.group_R || a.mix) gaussian_slopes(k, ms, Ps, f);
                     }
                 }
-                if (kind(k) == noise_gaussian) continue;
+                if (kind(k) == noise_gaussian) {
+                    fold<renew>(k, mf, Pf, f);
+                    continue;
+                }
                 if (silent(k) && out_of_reach(k, ms, Ps)) continue;
                 project(k, ms, Ps, Ph[count], z + count, v + count);
-                cavity[count] = cavity_of(k, z[count], larger(v[count], V(1e-300)));
-                if constexpr (!renew) look_at(t, k, z[count], v[count], cavity[count], f);
                 says[count++] = k;
             }
             if constexpr (renew) {
-                if (count > 0) {
-                    V dt[abreast], dn[abreast], mean[abreast], var[abreast];
-                    tilt(count, says, cavity, mean, var);
-                    for (int c = 0; c < count; c++) propose(says[c], z[c], v[c], cavity[c], mean[c], var[c], dt + c, dn + c, f, damping);
-                    for (int c = 0; c < count; c++) {
-                        if (c > 0) project(says[c], ms, Ps, Ph[c], z + c, v + c);
-                        const V gain = over(larger(V(1.0) + dt[c] * v[c], V(1e-12)));
-                        s.tau[says[c]] += dt[c];
-                        s.nu[says[c]] += dn[c];
-                        turn_by(Ph[c], (dn[c] - dt[c] * z[c]) * gain, dt[c] * gain, ms, Ps);
-                    }
+                V dt[abreast], dn[abreast];
+                if (!lone || !propose_lanes(count, says, z, v, dt, dn, f)) propose_each(count, says, z, v, dt, dn, f, damping);
+                for (int c = 0; c < count; c++) {
+                    if (c > 0) project(says[c], ms, Ps, Ph[c], z + c, v + c);
+                    const V gain = over(larger(V(1.0) + dt[c] * v[c], V(1e-12)));
+                    s.tau[says[c]] += dt[c];
+                    s.nu[says[c]] += dn[c];
+                    turn_by(Ph[c], (dn[c] - dt[c] * z[c]) * gain, dt[c] * gain, ms, Ps);
+                    fold<renew>(says[c], mf, Pf, f);
+                }
+            } else {
+                for (int c = 0; c < count; c++) {
+                    look_at(t, says[c], z[c], v[c], cavity_of(s.tau[says[c]], s.nu[says[c]], z[c], larger(v[c], V(1e-300))), f);
+                    fold<renew>(says[c], mf, Pf, f);
                 }
             }
-            for (int c = 0; c < count; c++) fold<renew>(says[c], mf, Pf, f);
-            for (int k = first; k < last; k++)
-                if (kind(k) == noise_gaussian) fold<renew>(k, mf, Pf, f);
         }
     }
-    // Tilted moments of some rows: of one member those of all boxes at a time, a row a lane.
-    inline void tilt(int count, const int* says, const Cavity<X>* cavity, V* mean, V* var) const {
-        bool boxes = lone;
-        for (int c = 0; c < count; c++) boxes = boxes && boxed(says[c]);
-        if (boxes) {
-            X lo, hi;
-            edges(says[0], &lo, &hi);
-            for (int c = 1; c < count; c++) {
-                X low, high;
-                edges(says[c], &low, &high);
-                lo = at_lane(c, low, lo);
-                hi = at_lane(c, high, hi);
-            }
-            spread_lanes(cut4<moments>(abreast_of(cavity, count), lo, hi), count, mean, var);
-            return;
+    // the changes of some rows' sites, one after the other
+    inline void propose_each(int count, const int* says, const V* z, const V* v, V* dt, V* dn, EpFound& f, double damping) const {
+        Cavity<X> cavity[abreast];
+        V spread[abreast], mean[abreast], var[abreast];
+        for (int c = 0; c < count; c++) {
+            spread[c] = larger(v[c], V(1e-300));
+            cavity[c] = cavity_of(s.tau[says[c]], s.nu[says[c]], z[c], spread[c]);
         }
         for (int c = 0; c < count; c++) {
             const int k = says[c];
             if (boxed(k)) {
-                X lo, hi;
-                edges(k, &lo, &hi);
-                const Truncated<X> q = cut4<moments>(cavity[c], lo, hi);
+                const Truncated<X> q = cut4<moments>(cavity[c], low(k).v, high(k).v);
                 mean[c] = of(q.mean);
                 var[c] = of(q.var);
             } else {
@@ -505,37 +496,50 @@ struct Ep {
                 var[c] = of(q.var);
             }
         }
+        for (int c = 0; c < count; c++) {
+            const int k = says[c];
+            // by what the site changes: a site that stays leaves the belief as it is, whatever rounding made of v
+            const V step(single(k) ? 1.0 : damping);
+            propose(s.tau[k], s.nu[k], z[c], spread[c], cavity[c], mean[c], var[c], V(least(k)), dt + c, dn + c, f);
+            dt[c] = step * dt[c];
+            dn[c] = step * dn[c];
+        }
+    }
+    // Those of one member, all at a time, a row a lane; false where they are no boxes.
+    HW_INLINE bool propose_lanes(int count, const int* says, const V* z, const V* v, V* dt, V* dn, EpFound& f) const {
+        for (int c = 0; c < count; c++)
+            if (!boxed(says[c])) return false;
+        if (count == 0) return true;
+        const auto lane = [&](const auto& each) { return in_lanes(count, [&](int c) { return each(says[c]); }); };
+        const V own = lane([&](int k) { return s.tau[k]; }), first = lane([&](int k) { return s.nu[k]; });
+        const V lo = lane([&](int k) { return low(k); }), hi = lane([&](int k) { return high(k); });
+        const V share = lane([&](int k) { return V(least(k)); });
+        const V at = in_lanes(count, [&](int c) { return z[c]; }), spread = in_lanes(count, [&](int c) { return larger(v[c], V(1e-300)); });
+        const Cavity<X> cavity = cavity_of(own, first, at, spread);
+        const Truncated<X> q = cut4<moments>(cavity, lo.v, hi.v);
+        V turn, move;
+        propose(own, first, at, spread, cavity, of(q.mean), of(q.var), share, &turn, &move, f);
+        for (int c = 0; c < count; c++) {
+            dt[c] = V(turn[c]);
+            dn[c] = V(move[c]);
+        }
+        return true;
     }
     inline bool boxed(int k) const { return kind(k) == noise_uniform || kind(k) == ep_truncation; }
-    static inline void spread_lanes(const Truncated<X>& q, int count, V* mean, V* var) {
-        for (int c = 0; c < count; c++) {
-            mean[c] = V(q.mean[c]);
-            var[c] = V(q.var[c]);
-        }
-    }
-    inline void edges(int k, X* lo, X* hi) const {
-        if (kind(k) == noise_uniform) {
-            *hi = s.s[a.group[k]].v;
-            *lo = -*hi;
-        } else {
-            *lo = all<X>(a.lo[k]);
-            *hi = all<X>(a.hi[k]);
-        }
-    }
-    // lane c of `here`, the others of `there`
-    static inline X at_lane(int c, const X& here, const X& there) {
+    // ends of its box
+    inline V low(int k) const { return kind(k) == noise_uniform ? -s.s[a.group[k]] : V(a.lo[k]); }
+    inline V high(int k) const { return kind(k) == noise_uniform ? s.s[a.group[k]] : V(a.hi[k]); }
+    // of (0), of (1), ... each the same in all its lanes, one a lane; the others as the first
+    template <class Each>
+    static inline V in_lanes(int count, const Each& each) {
         typedef decltype(X{} < X{}) Whole;
         static const Whole lane[abreast] = {Whole{-1}, Whole{0, -1}, Whole{0, 0, -1}};
-        return lane[c] ? here : there;
-    }
-    // a few cavities of one member, one a lane
-    static inline Cavity<X> abreast_of(const Cavity<X>* each, int count) {
-        Cavity<X> one = each[0];
-        for (int c = 1; c < count; c++)
-            one = {at_lane(c, each[c].mu, one.mu), at_lane(c, each[c].c, one.c), at_lane(c, each[c].sd, one.sd),
-                   at_lane(c, each[c].scale, one.scale)};
+        V one = each(0);
+        for (int c = 1; c < count; c++) one = either(lane[c], each(c), one);
         return one;
     }
+    // share of a cavity's variance below which a factor must leave that of row k
+    inline double least(int k) const { return 1.0 - (kind(k) == ep_truncation ? faint : 1e-13); }
     // d log Z / d log R = ((z^2 + v) / R - 1) / 2 of a Gaussian row whose residual has the posterior N(z, v)
     inline void gaussian_slopes(int k, const V* ms, const V* Ps, EpFound& f) const {
         V Ph[cap], z, v;
@@ -559,26 +563,22 @@ struct Ep {
         return !any4((near < X{}) | (near * near < least) | (v.v != v.v));
     }
 
-    // the cavity of row k; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
-    inline Cavity<X> cavity_of(int k, const V& z, const V& v) const {
-        const V open = larger(V(1.0) - s.tau[k] * v, V(1e-9)), over_open = over(open);
-        const V c = smaller(v * over_open, V(1e300)), mu = (z - v * s.nu[k]) * over_open, scale = root(open * over(v));
+    // the cavity of a row; a site that claims all that the belief has, or more, is a bad one and is taken as nothing
+    static inline Cavity<X> cavity_of(const V& tau, const V& nu, const V& z, const V& v) {
+        const V open = larger(V(1.0) - tau * v, V(1e-9)), over_open = over(open);
+        const V c = smaller(v * over_open, V(1e300)), mu = (z - v * nu) * over_open, scale = root(open * over(v));
         return {mu.v, c.v, (c * scale).v, scale.v};
     }
 
-    // the change of row k's site that reproduces its moments
-    inline void propose(int k, const V& z, const V& spread, const Cavity<X>& cavity, const V& mean, const V& var,
-                        V* dt, V* dn, EpFound& f, double damping) const {
-        const V v = larger(spread, V(1e-300)), scale = of(cavity.scale), w = scale * scale;
-        const V tv = larger(var, V(1e-300)), over_tv = over(tv);
+    // the change of a row's site that reproduces the moments of its factor, which count where it leaves less than the share
+    // `most` of the cavity's variance
+    static inline void propose(const V& own, const V& first, const V& z, const V& v, const Cavity<X>& cavity, const V& mean, const V& var,
+                               const V& most, V* dt, V* dn, EpFound& f) {
+        const V scale = of(cavity.scale), w = scale * scale, tv = larger(var, V(1e-300)), over_tv = over(tv);
         note(f, z, v, mean, tv, over_tv, cavity);
-        // else the factor widens the belief: nothing for now
-        const auto says = tv.v < cavity.c * (1.0 - (kind(k) == ep_truncation ? faint : 1e-13));
-        const V tau = either(says, over_tv - w, V(0.0)), nu = either(says, mean * over_tv - of(cavity.mu) * w, V(0.0));
-        // by what the site changes: a site that stays leaves the belief as it is, whatever rounding made of v
-        const V step(single(k) ? 1.0 : damping);
-        *dt = step * (tau - s.tau[k]);
-        *dn = step * (nu - s.nu[k]);
+        const auto says = tv.v < cavity.c * most.v;  // else the factor widens the belief: nothing for now
+        *dt = either(says, over_tv - w, V(0.0)) - own;
+        *dn = either(says, mean * over_tv - of(cavity.mu) * w, V(0.0)) - first;
     }
 
     inline void look_at(int t, int k, const V& z, const V& spread, const Cavity<X>& cavity, EpFound& f) {
@@ -1094,12 +1094,11 @@ struct Ep {
     template <bool renew>
     inline void sites(int t, V* W, V* r, EpFound& f) {
         V *m = s.m + t * n, *D = s.D + t * n;
-        for (int first = 0; first < n; first += abreast) {
-            const int last = first + abreast < n ? first + abreast : int(n);
-            V half[abreast], told[abreast];
-            Cavity<X> cavity[abreast];
+        for (int i = 0; i < n;) {
+            const int from = i;
+            V half[abreast], know[abreast];
             int at[abreast], count = 0;
-            for (int i = first; i < last; i++) {
+            for (; i < n && i < from + abreast; i++) {
                 if constexpr (!renew) {
                     if (t > 0 && fitted(i)) {  // g_i has the posterior mean p r_i and variance p - p W_ii p
                         const V p = power(i), share = p * W[i * n + i];
@@ -1109,69 +1108,90 @@ struct Ep {
                     if (bent(t)) cross.w3[t * n + i] = cross.w4[t * n + i] = V(0.0);
                 }
                 if (!has_site(t, i)) continue;
-                const V width_i = larger(width(t, i), V(1e-150)), square = width_i * width_i;
-                V know = W[i * n + i];
-                if (any4(know.v * square.v < all<X>(1e-8))) know = larger(know, V(1e-8) / square);  // nothing known: a wide cavity
-                const V over_know = over(know), share = D[i] * know;
-                const V open = larger(V(1.0) - share, V(1e-12) * share);
-                const V c = open * over_know, mu = m[i] + r[i] * over_know, scale = root(know * over(open));
-                cavity[count] = {mu.v, c.v, (c * scale).v, scale.v};
-                half[count] = width_i;
-                told[count] = share;
+                half[count] = larger(width(t, i), V(1e-150));
+                know[count] = W[i * n + i];
                 at[count++] = i;
             }
             if (count == 0) continue;
             if constexpr (renew) {
-                V mean[abreast], var[abreast], dD[abreast], dm[abreast];
+                V dD[abreast], dm[abreast];
                 if (lone) {
-                    X box = half[0].v;
-                    for (int c = 1; c < count; c++) box = at_lane(c, half[c].v, box);
-                    spread_lanes(cut4<moments>(abreast_of(cavity, count), -box, box), count, mean, var);
+                    const auto lane = [&](const V* each) { return in_lanes(count, [&](int c) { return each[at[c]]; }); };
+                    V wider, move;
+                    renew_noise(in_lanes(count, [&](int c) { return half[c]; }), in_lanes(count, [&](int c) { return know[c]; }), lane(D),
+                                lane(m), lane(r), &wider, &move, f);
+                    for (int c = 0; c < count; c++) {
+                        dD[c] = V(wider[c]);
+                        dm[c] = V(move[c]);
+                    }
                 } else {
+                    Cavity<X> cavity[abreast];
+                    V told[abreast], mean[abreast], var[abreast];
+                    for (int c = 0; c < count; c++) told[c] = noise_cavity(half[c], know[c], D[at[c]], m[at[c]], r[at[c]], cavity + c);
                     for (int c = 0; c < count; c++) {
                         const Truncated<X> q = cut4<moments>(cavity[c], -half[c].v, half[c].v);
                         mean[c] = of(q.mean);
                         var[c] = of(q.var);
                     }
+                    for (int c = 0; c < count; c++)
+                        propose_noise(cavity[c], told[c], mean[c], var[c], D[at[c]], m[at[c]], r[at[c]], dD + c, dm + c, f);
                 }
                 for (int c = 0; c < count; c++) {
-                    const int i = at[c];
-                    const V tv = var[c], tm = mean[c], mu = of(cavity[c].mu), scale = of(cavity[c].scale);
-                    const V floored = larger(tv, V(1e-300));
-                    note(f, m[i] + D[i] * r[i], D[i] * (V(1.0) - told[c]), tm, floored, over(floored), cavity[c]);
-                    // 1 - tilted variance over the cavity's
-                    const V wider = over(larger(V(1.0) - tv * scale * scale, V(1e-6)));
-                    dD[c] = tv * wider - D[i];
-                    dm[c] = mu + (tm - mu) * wider - m[i];
-                }
-                for (int c = 0; c < count; c++) {
-                    const int i = at[c];
-                    const V gain = over(larger(V(1.0) + dD[c] * W[i * n + i], V(1e-12)));
+                    const int j = at[c];
+                    const V gain = over(larger(V(1.0) + dD[c] * W[j * n + j], V(1e-12)));
                     V column[cap];
-                    for (int j = 0; j < n; j++) column[j] = W[i * n + j];
-                    turn_by(column, -(r[i] * dD[c] + dm[c]) * gain, dD[c] * gain, r, W);
-                    D[i] += dD[c];
-                    m[i] += dm[c];
+                    for (int l = 0; l < n; l++) column[l] = W[j * n + l];
+                    turn_by(column, -(r[j] * dD[c] + dm[c]) * gain, dD[c] * gain, r, W);
+                    D[j] += dD[c];
+                    m[j] += dm[c];
                 }
             } else {
                 for (int c = 0; c < count; c++) {
-                    const int i = at[c];
-                    const Tilted<X> q = bent(t) ? uniform4<cumulants>(cavity[c], half[c].v) : uniform4<evidence>(cavity[c], half[c].v);
-                    const V tv = larger(of(q.var), V(1e-300)), var = D[i] * (V(1.0) - told[c]);
-                    note(f, m[i] + D[i] * r[i], var, of(q.mean), tv, over(tv), cavity[c]);
-                    const V spread = D[i] + of(cavity[c].c), d = m[i] - of(cavity[c].mu);
+                    const int j = at[c];
+                    Cavity<X> cavity;
+                    const V told = noise_cavity(half[c], know[c], D[j], m[j], r[j], &cavity);
+                    const Tilted<X> q = bent(t) ? uniform4<cumulants>(cavity, half[c].v) : uniform4<evidence>(cavity, half[c].v);
+                    const V tv = larger(of(q.var), V(1e-300)), var = D[j] * (V(1.0) - told);
+                    note(f, m[j] + D[j] * r[j], var, of(q.mean), tv, over(tv), cavity);
+                    const V spread = D[j] + of(cavity.c), d = m[j] - of(cavity.mu);
                     f.log_z += of(q.log_z) + V(0.5) * (V(log_2pi) + d * d * over(spread));
                     f.above.add(spread);
-                    f.worst = smaller(f.worst, of(q.log_z) + (t > 0 ? s.log_box[a.group_w[i]] : log_of(V(2.0) * half[c])));
+                    f.worst = smaller(f.worst, of(q.log_z) + (t > 0 ? s.log_box[a.group_w[j]] : log_of(V(2.0) * half[c])));
                     if (t > 0) {
                         const V share = larger(V(1.0) - V(3.0) * var / (half[c] * half[c]), V(0.0));
-                        f.slope[a.group_w[i]] += of(q.slope_s);
-                        f.learned[a.group_w[i]] += share * share;
+                        f.slope[a.group_w[j]] += of(q.slope_s);
+                        f.learned[a.group_w[j]] += share * share;
                     }
-                    if (bent(t)) ratios(q, var, cross.w3 + t * n + i, cross.w4 + t * n + i);
+                    if (bent(t)) ratios(q, var, cross.w3 + t * n + j, cross.w4 + t * n + j);
                 }
             }
         }
+    }
+    // The cavity of a site (m, D) of w_i of this half-width, given W_ii and r_i; returns D W_ii.
+    static inline V noise_cavity(const V& half, const V& W, const V& D, const V& m, const V& r, Cavity<X>* cavity) {
+        const V square = half * half;
+        V know = W;
+        if (any4(know.v * square.v < all<X>(1e-8))) know = larger(know, V(1e-8) / square);  // nothing known: a wide cavity
+        const V over_know = over(know), share = D * know, open = larger(V(1.0) - share, V(1e-12) * share);
+        const V c = open * over_know, mu = m + r * over_know, scale = root(know * over(open));
+        *cavity = {mu.v, c.v, (c * scale).v, scale.v};
+        return share;
+    }
+    // the change of that site that reproduces the moments of its factor
+    static inline void propose_noise(const Cavity<X>& cavity, const V& told, const V& mean, const V& var, const V& D, const V& m, const V& r,
+                                     V* dD, V* dm, EpFound& f) {
+        const V mu = of(cavity.mu), scale = of(cavity.scale), floored = larger(var, V(1e-300));
+        note(f, m + D * r, D * (V(1.0) - told), mean, floored, over(floored), cavity);
+        const V wider = over(larger(V(1.0) - var * scale * scale, V(1e-6)));  // 1 - tilted variance over the cavity's
+        *dD = var * wider - D;
+        *dm = mu + (mean - mu) * wider - m;
+    }
+    // both, of one member's sites, one a lane
+    static inline void renew_noise(const V& half, const V& W, const V& D, const V& m, const V& r, V* dD, V* dm, EpFound& f) {
+        Cavity<X> cavity;
+        const V told = noise_cavity(half, W, D, m, r, &cavity);
+        const Truncated<X> q = cut4<moments>(cavity, -half.v, half.v);
+        propose_noise(cavity, told, of(q.mean), of(q.var), D, m, r, dD, dm, f);
     }
 
     // belief about x_t to the caller
@@ -1202,6 +1222,11 @@ struct Ep {
         clear(f);
         forward<true>(f, damping);
         backward<true>(f, a.T);
+        if (lone)
+            for (int l = 0; l < wide_lanes; l++) {
+                f.residual = larger(f.residual, V(f.residual[l]));
+                f.far = larger(f.far, V(f.far[l]));
+            }
         f.residual = root(f.residual);
     }
 
