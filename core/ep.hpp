@@ -29,7 +29,6 @@
 #include "lane.hpp"
 #include "noise.hpp"
 
-#define HW_INLINE inline __attribute__((always_inline))
 namespace hw {
 namespace HW_ISA {
 
@@ -197,6 +196,7 @@ struct Ep {
     // A bound farther off than the root of `reach` standard deviations, or one that narrows its cavity's variance by a
     // share below `faint`, says nothing at the precision that is asked for.
     double reach = 72.0, faint = 1e-13;
+    double little = 0.0;  // what a factor adds to log Z with all of a later stage, below which stages beyond are left out
     bool mixed = false;  // rows with two explanations
     bool lone = false;   // one member: its sites take the lanes
 
@@ -336,7 +336,7 @@ struct Ep {
     }
 
     // Lambda, eta: the future's message and the rows of t
-    HW_INLINE void ahead(int t, V* Lambda, V* eta) const {
+    [[gnu::always_inline]] inline void ahead(int t, V* Lambda, V* eta) const {
         const V* Lb = s.Lb + t * packed();
         for (int i = 0; i < n; i++)
             for (int j = 0; j <= i; j++) Lambda[i * n + j] = Lb[tri(i, j)];
@@ -400,7 +400,7 @@ struct Ep {
     }
 
     // residual z, its variance v and covariance Ph with x_t, of row k in a belief
-    HW_INLINE void project(int k, const V* ms, const V* Ps, V* Ph, V* z, V* v) const {
+    [[gnu::always_inline]] inline void project(int k, const V* ms, const V* Ps, V* Ph, V* z, V* v) const {
         if (const int i = s.axis[k]; i >= 0) {
             *z = ms[i] - target(k);
             *v = Ps[i * n + i];
@@ -506,7 +506,7 @@ struct Ep {
         }
     }
     // Those of one member, all at a time, a row a lane; false where they are no boxes.
-    HW_INLINE bool propose_lanes(int count, const int* says, const V* z, const V* v, V* dt, V* dn, EpFound& f) const {
+    [[gnu::always_inline]] inline bool propose_lanes(int count, const int* says, const V* z, const V* v, V* dt, V* dn, EpFound& f) const {
         for (int c = 0; c < count; c++)
             if (!boxed(says[c])) return false;
         if (count == 0) return true;
@@ -999,9 +999,10 @@ struct Ep {
     inline V later(int t, int last, const V* g, const V& k3, const V& k4, const V (*C)[cap * cap], const V (*R)[cap * cap]) const {
         const V a3 = k3 * V(1.0 / 6.0), a4 = k4 * V(1.0 / 24.0);
         V sum(0.0);
-        for (int l = 0; l < last; l++) {
+        bool counts = true;  // what is farther than what adds little adds less
+        for (int l = 0; l < last && (counts || t + last >= shaped); l++) {
             const int u = t + l + 1;
-            V cov[cap];
+            V cov[cap], more(0.0);
             for (int j = 0; j < n; j++) {
                 V c(0.0), q(0.0);
                 for (int i = 0; i < n; i++) {
@@ -1009,10 +1010,13 @@ struct Ep {
                     q += g[i] * R[l][i * n + j];
                 }
                 cov[j] = q;
-                if (has_site(u, j)) sum += pair(c, a3, a4, cross.w3[u * n + j], cross.w4[u * n + j]);
+                if (counts && has_site(u, j)) more += pair(c, a3, a4, cross.w3[u * n + j], cross.w4[u * n + j]);
             }
             bend(u, cov, k3, k4);
-            sum += with_rows(u, a.start[u], cov, a3, a4);
+            if (!counts) continue;
+            more += with_rows(u, a.start[u], cov, a3, a4);
+            sum += more;
+            counts = any4(abs4(more.v) >= all<X>(little));
         }
         return sum;
     }

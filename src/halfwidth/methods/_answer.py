@@ -9,6 +9,7 @@ import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.methods._carry import Known, Start
 from halfwidth.methods._noise_parts import uniform_part
+from halfwidth.methods._protocol import Estimator, typed
 from halfwidth.methods._sites import Sites
 from halfwidth.model import Linear
 from halfwidth.record import Record
@@ -27,8 +28,7 @@ class Answer:
 
     Parameters
     ----------
-    method : str
-        As it would be typed.
+    method : Estimator
     model, record, chain
         What was asked.
     found, handed : EpFound, EpHanded
@@ -40,7 +40,7 @@ class Answer:
     """
 
     def __init__(
-        self, method: str, model: Linear, record: Record, chain: Sites, found: _core.EpFound, handed: _core.EpHanded,
+        self, method: Estimator, model: Linear, record: Record, chain: Sites, found: _core.EpFound, handed: _core.EpHanded,
         code: int, rate: float,
     ) -> None:  # fmt: skip
         self.method, self.model, self.record, self.chain = method, model, record, chain
@@ -160,7 +160,7 @@ class Answer:
             x[1:].copy(),
             self.spread,
             self.status,
-            self.method,
+            typed(self.method),
             q=mean[:nx].copy() if sound and uniform_part(model.w) is not None else None,
             r=mean[nx:p].copy() if sound and uniform_part(model.e) is not None else None,
             Q=mean[p : p + nx].copy() if sound and fitted[p : p + nx].any() else None,

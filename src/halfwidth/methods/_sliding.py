@@ -212,7 +212,8 @@ class Sliding:
         assert isinstance(method, Posterior)
         answer = method.resumed(model, part, held, self.held.first + a, a, max(len(part) - self.window.lag, 0))
         newest = self.held.first + len(self.held) - 1
-        rows = max(int(np.count_nonzero(part.seen.any(axis=1))), self.window.memory + 1)
+        seen = int(np.count_nonzero(part.seen.any(axis=1))) if self.held.lost else len(part)
+        rows = max(seen, self.window.memory + 1)
         held.take(answer, newest, rows, counts=self.since == 0)
         return Solved(answer.x, _NONE, answer.s, answer.status, 0, answer.said, answer.spread, answer.variances)
 

@@ -41,7 +41,6 @@ from halfwidth.loss import Bernoulli
 from halfwidth.methods._answer import Answer
 from halfwidth.methods._carry import Carried, Known, Start, condition
 from halfwidth.methods._noise_parts import gaussian_part, uniform_part, unknowns
-from halfwidth.methods._protocol import typed
 from halfwidth.methods._sites import Frame, Sites, frames_of, sites
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian
@@ -278,7 +277,7 @@ class Posterior:
             if quick is not None and quick.code < 2:
                 start = Start(np.where(quick.chain.free, quick.start.s, problem.guess))
         found, handed, code = self._solve(problem, model, start, drop, known, shaped)
-        return Answer(_typed(self), model, record, problem, found, handed, code, self._rate(model)[0])
+        return Answer(self, model, record, problem, found, handed, code, self._rate(model)[0])
 
     def _solve(
         self, chain: Sites, model: Linear, start: Start | None, drop: int, known: Known | None, shaped: int
@@ -343,11 +342,6 @@ class Posterior:
         if self.outliers is True:
             return 0.01, True, _RATE
         return float(self.outliers), False, (1.0, 1.0)
-
-
-@functools.lru_cache(maxsize=64)
-def _typed(method: Posterior) -> str:
-    return typed(method)
 
 
 @functools.lru_cache(maxsize=64)
