@@ -130,7 +130,6 @@ std::size_t learner_parameters(const EpLearnArgs& a) {
 template <class N>
 int learn(N n, const EpLearnArgs& a) {
     Ep<N> ep{n, a.base, {0, wide_lanes - 1}, {}, {}, a.shaped};
-    ep.little = ep_little;
     EpLearner<N> learner{ep, a};
     Place place{reinterpret_cast<V*>(a.base.work)};
     settle_in(ep, learner.f, place);

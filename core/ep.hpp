@@ -196,7 +196,6 @@ struct Ep {
     // A bound farther off than the root of `reach` standard deviations, or one that narrows its cavity's variance by a
     // share below `faint`, says nothing at the precision that is asked for.
     double reach = 72.0, faint = 1e-13;
-    double little = 0.0;  // what a factor adds to log Z with all of a later stage, below which stages beyond are left out
     bool mixed = false;  // rows with two explanations
     bool lone = false;   // one member: its sites take the lanes
 
@@ -999,10 +998,9 @@ struct Ep {
     inline V later(int t, int last, const V* g, const V& k3, const V& k4, const V (*C)[cap * cap], const V (*R)[cap * cap]) const {
         const V a3 = k3 * V(1.0 / 6.0), a4 = k4 * V(1.0 / 24.0);
         V sum(0.0);
-        bool counts = true;  // what is farther than what adds little adds less
-        for (int l = 0; l < last && (counts || t + last >= shaped); l++) {
+        for (int l = 0; l < last; l++) {
             const int u = t + l + 1;
-            V cov[cap], more(0.0);
+            V cov[cap];
             for (int j = 0; j < n; j++) {
                 V c(0.0), q(0.0);
                 for (int i = 0; i < n; i++) {
@@ -1010,13 +1008,10 @@ struct Ep {
                     q += g[i] * R[l][i * n + j];
                 }
                 cov[j] = q;
-                if (counts && has_site(u, j)) more += pair(c, a3, a4, cross.w3[u * n + j], cross.w4[u * n + j]);
+                if (has_site(u, j)) sum += pair(c, a3, a4, cross.w3[u * n + j], cross.w4[u * n + j]);
             }
             bend(u, cov, k3, k4);
-            if (!counts) continue;
-            more += with_rows(u, a.start[u], cov, a3, a4);
-            sum += more;
-            counts = any4(abs4(more.v) >= all<X>(little));
+            sum += with_rows(u, a.start[u], cov, a3, a4);
         }
         return sum;
     }

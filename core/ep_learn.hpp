@@ -34,7 +34,6 @@ constexpr double ep_some = 10.0;  // effective points without which the evidence
 constexpr int ep_few = 2;     // rows that may come or go while the mode stays
 constexpr double ep_sure = 0.25;  // standard deviations in which a step of Newton errs by no more than the mode may
 constexpr double ep_apart = 1.0;  // disagreement of moments, in standard deviations, beyond which no step is taken
-constexpr double ep_little = 1e-4;  // of log Z, that may be left out of one factor's second order
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 
 template <class N>

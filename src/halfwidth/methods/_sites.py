@@ -174,9 +174,9 @@ class Sites:
 
     @property
     def guess(self) -> Array:
-        """First values of all groups from the data's scale, (p,): of half-widths half of what that makes of a uniform."""
+        """Generous first values of all groups from the data's scale, (p,)."""
         fitted = self.frame.fitted
-        size = np.where(fitted, self.scale, 0.5 * math.sqrt(3.0) * self.scale)
+        size = np.where(fitted, self.scale, math.sqrt(3.0) * self.scale)
         return np.where(self.frame.uniform | fitted, size.clip(self.floor, self.cap), 0.0)
 
     @property
