@@ -18,7 +18,7 @@ from halfwidth.vehicle.pointing import azimuth_of
 Floats = NDArray[np.float64]
 
 #: What a gap is solved with of the drive on each side, s.
-_AROUND = 60.0
+_AROUND = 20.0
 
 #: Two guesses that differ by less than this everywhere are one, rad: the chain finds its way from there.
 _NEAR = 0.5

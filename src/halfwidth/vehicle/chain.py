@@ -68,7 +68,7 @@ LONGITUDINAL, LATERAL, SLIP, YAW, OFFSET, DRIFT, FIX = range(7)
 _BATCH = 20_000
 
 #: Rounds in which a gap without a yaw rate is tried from another side.
-_TRIAL = 10
+_TRIAL = 6
 
 E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS, DRIFT_E, DRIFT_N, TURN = range(10)
 
