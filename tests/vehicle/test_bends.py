@@ -94,7 +94,7 @@ def test_the_likelier_way_is_taken():
     ((which, sizes, starts),) = asked
     assert which == [0, 0]
     assert sizes[0] == sizes[1] < len(grid)
-    first = a - int(np.searchsorted(grid.t, grid.t[a] - 60))
+    first = a - int(np.searchsorted(grid.t, grid.t[a] - 20))
     np.testing.assert_allclose(found[a : b + 1], starts[1][first : first + b - a + 1] + 0.01)
     np.testing.assert_array_equal(found[:a], own[:a])
     np.testing.assert_allclose(np.exp(1j * found[b + 1 :]), np.exp(1j * own[b + 1 :]))
