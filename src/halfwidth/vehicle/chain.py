@@ -30,7 +30,8 @@ posterior squared residuals (expectation maximisation, Shumway and Stoffer 1982)
 own path first. Many drives (outages of one log) are solved side by side.
 
 Where a yaw rate is silent for a while its residual has no noise of its own: the yaw rate is what the log's own are
-like, and how it deviates from what is expected between the samples on both sides is one more state (`turning`).
+like, and how it deviates from what is expected between the samples on both sides is one more state (`turning`). A gap
+without a yaw rate is solved from two sides, since a car may have gone round either way (`bends`).
 Without a speed sensor the speed is that of the fixes, with a large variance between them; without a gyro the yaw rate
 is taken as 0 and the scale of the yaw residual learns how much the car turns.
 """
