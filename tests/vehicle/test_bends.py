@@ -52,6 +52,10 @@ def test_gaps_without_a_yaw_rate_are_found():
     assert bends.unturned(replace(town(0, silent=False)[0], has_yaw_rate=False)) == [(a, b)]
     assert bends.unturned(replace(grid, seen=np.ones(len(grid), dtype=bool))) == []
     assert bends.unturned(replace(grid, seen=np.arange(len(grid)) == 5)) == []
+    # one fix a second and five nodes: only the gap is one
+    sparse = replace(grid, seen=grid.seen & (np.arange(len(grid)) % 5 == 0), has_yaw_rate=False)
+    ((a, b),) = bends.unturned(sparse)
+    assert (grid.t[a], grid.t[b]) == pytest.approx(GAP)
 
 
 @pytest.mark.parametrize("turn", [-1.5, -0.2, 0.0, 1.2, 2.5])

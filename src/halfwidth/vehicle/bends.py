@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from halfwidth.vehicle.chain_rows import in_gap
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.pointing import azimuth_of
 
@@ -29,12 +30,15 @@ Trial = Callable[[Sequence[int], Sequence[Grid], Sequence[Floats]], list[tuple[f
 
 
 def unturned(drive: Grid) -> list[tuple[int, int]]:
-    """Return the nodes of the fixes on both sides of each gap in which the yaw rate is silent for a step or more."""
+    """Return the nodes of the fixes on both sides of each gap in which the yaw rate is silent for a step or more.
+
+    Fixes that are as far apart as usual have no gap between them, however often the sensors speak.
+    """
     lost = drive.yaw_rate_sd > 0 if drive.has_yaw_rate else np.ones(len(drive), dtype=bool)
     until = np.concatenate(([0], np.cumsum(lost)))
     seen = np.flatnonzero(drive.seen)
     a, b = seen[:-1], seen[1:]
-    which = np.flatnonzero((b - a > 1) & (until[b + 1] > until[a + 1]))
+    which = np.flatnonzero((b - a > 1) & (until[b + 1] > until[a + 1]) & in_gap(drive)[b])
     return [(int(a[k]), int(b[k])) for k in which]
 
 
