@@ -15,7 +15,8 @@ from halfwidth.methods._residuals import half_width_bounds, reference, residuals
 from halfwidth.model import Entry, Linear, Model, Nonlinear, arity
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
-from halfwidth.solvers.banded import Chain, chain_of, solve
+from halfwidth.solvers.banded import solve
+from halfwidth.solvers.chain import Chain, chain_of
 from halfwidth.spread import Box, Normal
 from halfwidth.tape import Tape, Untraceable
 from halfwidth.trace import compiled

@@ -40,7 +40,8 @@ from halfwidth.methods.sequential import SequentialLP
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.solvers.banded import Start, chain_of, solve
+from halfwidth.solvers.banded import Start, solve
+from halfwidth.solvers.chain import chain_of
 from halfwidth.spread import Both, Box, Cloud, Normal, Shaped, Spread
 from halfwidth.spread import part as rows_of_spread
 

@@ -164,8 +164,7 @@ def foretold(model: Model, est: Estimate, record: Record) -> tuple[Array, Array]
     else:
         if model.theta_entries and est.theta is not None:
             model = filled(model, est.theta)
-        stack, index = model.C.stack(record.t, dt)
-        C = np.broadcast_to(stack, (len(record), *stack.shape[1:])) if index is None else stack[index]
+        C = model.C.each(record.t, dt)
         mean = np.einsum("tij,tj->ti", C, est.x)
     R = np.zeros((len(record), model.ny, model.ny))
     box, part = uniform_part(model.e), gaussian_part(model.e)
@@ -174,12 +173,10 @@ def foretold(model: Model, est: Estimate, record: Record) -> tuple[Array, Array]
     if part is not None and not part.known:
         R = R + np.diag(np.asarray(est.R))
     elif part is not None:
-        own, which = part.cov().stack(record.t, dt)
-        R = R + (own if which is None else own[which])
+        R = R + part.cov().each(record.t, dt)
     var = C @ np.asarray(est.P) @ np.swapaxes(C, 1, 2) + R
     if isinstance(model, Linear) and model.F is not None:
-        own, which = model.F.stack(record.t, dt)
-        back = np.linalg.inv(own if which is None else own[which])
-        mean = np.einsum("tij,tj->ti", np.broadcast_to(back, var.shape), mean)
+        back = np.linalg.inv(model.F.each(record.t, dt))
+        mean = np.einsum("tij,tj->ti", back, mean)
         var = back @ var @ np.swapaxes(back, -1, -2)
     return mean, var
