@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from halfwidth.array import Array
+from halfwidth.array import Array, wrapped
 from halfwidth.methods._noise_parts import gaussian_part, uniform_part
 from halfwidth.methods._residuals import first_scales
 from halfwidth.model import Linear, Nonlinear, arity
@@ -153,10 +153,7 @@ def _inputs(model: Nonlinear, record: Record) -> tuple[Array | None, Array]:
 def _outputs(model: Nonlinear, record: Record, X: Array) -> tuple[Array, Array]:
     """Return outputs less those of a path (T, ny), angles wrapped, and the Jacobians of `h` along it."""
     h, C = outputs_along(model, X[1:])
-    off = record.y - h
-    angles = list(model.y_angles)
-    off[:, angles] = np.mod(off[:, angles] + np.pi, 2 * np.pi) - np.pi
-    return off, C
+    return wrapped(record.y - h, model.y_angles), C
 
 
 def outputs_along(model: Nonlinear, x: Array) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from halfwidth.array import Array, generator
+from halfwidth.array import Array, generator, wrapped
 from halfwidth.errors import BadValue, Refused, hinted
 from halfwidth.methods._linearised import filled
 from halfwidth.methods._noise_parts import gaussian_part, uniform_part
@@ -133,11 +133,7 @@ def compare(
             if not est.status.good or est.P is None or not mask.any():
                 continue
             mean, S = foretold(model, est, part)
-            d = record.y - mean
-            if isinstance(model, Nonlinear) and model.y_angles:
-                angles = list(model.y_angles)
-                d[:, angles] = np.mod(d[:, angles] + np.pi, 2 * np.pi) - np.pi
-            d = d[mask]
+            d = wrapped(record.y - mean, getattr(model, "y_angles", ()))[mask]
             v = np.diagonal(S, axis1=1, axis2=2)[mask]
             log_p.append(-0.5 * (np.log(2 * np.pi * v) + d**2 / v))
             off.append(np.abs(d) / np.broadcast_to(unit, mask.shape)[mask])
