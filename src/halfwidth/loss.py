@@ -285,6 +285,11 @@ class Markov(_Loss):
     kind, noise, center, sensors
         As for `Bernoulli`.
 
+    Raises
+    ------
+    BadShape, BadValue
+        If a probability is outside 0 to 1 or a shape does not fit.
+
     Examples
     --------
     >>> Markov(0.95, 0.85)
