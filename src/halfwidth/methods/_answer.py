@@ -40,8 +40,8 @@ class Answer:
     """
 
     def __init__(
-        self, method: Estimator, model: Linear, record: Record, chain: Sites, found: _core.EpFound, handed: _core.EpHanded,
-        code: int, rate: float,
+        self, method: Estimator, model: Linear, record: Record, chain: Sites, found: _core.EpFound,
+        handed: _core.EpHanded, code: int, rate: float,
     ) -> None:  # fmt: skip
         self.method, self.model, self.record, self.chain = method, model, record, chain
         self.found, self.handed, self.code, self.rate = found, handed, code, rate
