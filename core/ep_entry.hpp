@@ -93,7 +93,9 @@ struct EpLearnArgs {
     double beta_a, beta_b;                   // prior of the rate
     const double *pull, *precision, *known_power;  // (groups,), (groups,groups), (groups,): what is known already of s; or null
     int steps, few, many, most;              // Newton steps; sweeps of a step, of the first one, of a node
-    double tol, tol_nodes, close, near, least, narrow;  // near: the distance of the mode that does where sites are warm
+    // near: in standard deviations, the distance of the mode that does where sites are warm, and that of the nodes' mean from
+    // their centre beyond which the window after begins about the mean
+    double tol, tol_nodes, close, near, least, narrow;
     int nodes, stage;                        // at most so many points, so many a stage
     double usable;                           // disagreement of moments from which a point counts as not settled
     double enough;                           // doubt about the states, in standard deviations, that ends the stages
