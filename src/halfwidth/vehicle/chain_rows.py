@@ -18,6 +18,7 @@ class Rows:
     """All nodes of all drives, one drive below the other; R rows, n drives."""
 
     offsets: NDArray[np.int64]  # (n + 1,)
+    order: NDArray[np.int32]  # (n,) drives, the longest first: those that are solved side by side are about as long
     drive: NDArray[np.int32]  # (R,)
     first: Mask  # (R,)
     h: Floats
@@ -28,7 +29,7 @@ class Rows:
     extra: Floats  # (R, 3) variance added to longitudinal, lateral and yaw where a sensor was silent
     gap: Mask  # (R,) whether the step lies in a gap between fixes
     y: Floats  # (R, 2) fixes, about the first of each drive
-    seen: Mask  # (R, 2)
+    seen: Mask  # (R,)
     unknown: Mask  # (R, 3) where a sensor was silent
     origin: Floats  # (n, 2)
     far: Floats  # (n,) how far the first node may be from the first fix, m
@@ -76,6 +77,7 @@ def rows_of(drives: Sequence[Grid]) -> Rows:
     gap = np.concatenate([in_gap(drive) for drive in drives])
     return Rows(
         offsets,
+        np.argsort(-sizes, kind="stable").astype(np.int32),
         index,
         first,
         h,
@@ -86,7 +88,7 @@ def rows_of(drives: Sequence[Grid]) -> Rows:
         extra,
         gap,
         y,
-        np.column_stack((seen, seen)),
+        seen,
         unknown,
         origin,
         far,
