@@ -186,6 +186,18 @@ inline DriveLane pivot(int n, DriveLane left, DriveLane was) {
     return where_positive(left - least, DriveLane(1.0) / left, DriveLane(0.0));
 }
 
+// Where a variance fell to rounding noise of what it was that state is now certain, and what cancelled is taken for 0:
+// its row and column are those of `rest` (i, j), which was not found by cancellation.
+template <int N, class Rest>
+inline void clear(const DriveLane* was, DriveLane (*P)[N], Rest rest) {
+    constexpr double rounding = 64.0 * eps;
+    for (int i = 0; i < N; i++) {
+        if (!any4(P[i][i].v < rounding * was[i].v)) continue;
+        const DriveLane gone = DriveLane(rounding) * was[i] - P[i][i];
+        for (int j = 0; j < N; j++) P[i][j] = P[j][i] = where_positive(gone, rest(i, j), P[i][j]);
+    }
+}
+
 // X <- P^-1 X; P (N,N) is left as its factor L D L'.
 template <int N>
 inline void solve_in_place(DriveLane (*P)[N], DriveLane (*X)[N]) {
@@ -301,7 +313,8 @@ struct Drives {
 
     // Fold the fixes of a row into x, P where they are seen; return their log-likelihood.
     inline V correct(const V* y, V seen) {
-        V CP[2][N], K[2][N], CM[2][N];
+        V CP[2][N], K[2][N], CM[2][N], was[N];
+        for (int i = 0; i < N; i++) was[i] = P[i][i];
         for (int j = 0; j < N; j++) {
             CP[0][j] = P[d_e][j] + P[d_oe][j];
             CP[1][j] = P[d_n][j] + P[d_on][j];
@@ -325,6 +338,7 @@ struct Drives {
         }
         for (int i = 0; i < N; i++)
             for (int j = 0; j <= i; j++) P[i][j] = P[j][i] = M[i][j] + (K[0][i] * CM[0][j] + K[1][i] * CM[1][j]);
+        clear<N>(was, P, [&](int i, int j) { return r * (K[0][i] * K[0][j] + K[1][i] * K[1][j]); });
         return V(-0.5) * (v0 * v0 * i0 + z1 * z1 * i1 + dets + V(2 * log_2pi));
     }
 
@@ -411,6 +425,13 @@ struct Drives {
             for (int j = 0; j < N; j++) P[i][j] = V(0.0);
         add_half<N>(Z, D, P);
         add_half<N>(G, M, P);
+        V was[N];
+        for (int i = 0; i < N; i++) was[i] = P1[i][i];
+        clear<N>(was, P, [&](int i, int j) {
+            V sum(0.0);
+            for (int k = 0; k < N; k++) sum += G[k][i] * M[k][j];
+            return sum;
+        });
     }
     // The expected squares of the residuals into row t, of which xs, D are the smoothed mean before it and P + A P A'.
     inline void squares(std::int64_t t, const std::int64_t* at, const V* xs, const V (*D)[N]) const {
@@ -434,7 +455,7 @@ struct Drives {
                 for (int j = 0; j < i; j++) row += D[i][j] * u[j];
                 sum += row * u[i];
             }
-            found[group] += mean * mean + V(2.0) * sum + s.noise(rest);
+            found[group] += mean * mean + larger(V(2.0) * sum, V(0.0)) + s.noise(rest);
         };
         const V none(0.0), one(1.0);
         const V along[] = {s.S, s.C, none, none, none, none, none, none, none, none};

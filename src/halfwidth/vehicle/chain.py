@@ -205,7 +205,7 @@ def _solved(
         out = _smoothed(rows, line, s2, share, settings, squares=not last and (learn or jumps), covariances=last)
         found = out.x[:, AZIMUTH]
         psi = np.where(np.isfinite(found), found, psi)
-        if out.squares is not None:
+        if out.squares.size:
             squares = _squares(rows, out.squares)
             if jumps:
                 share = _shares(rows, squares[:, OFFSET], s2, settings.tail)
@@ -236,8 +236,8 @@ class _Smoothed:
     """What the core returns, one drive below the other."""
 
     x: Floats  # (R, 9)
-    P: Floats | None  # (R, 9, 9)
-    squares: Floats | None  # (R, 5) expected squares of the residuals, given all fixes
+    P: Floats  # (R, 9, 9), and
+    squares: Floats  # (R, 5) expected squares of the residuals, given all fixes: empty where they are not asked for
     misfit: Floats  # (n,) sums of the expected squares of what fixes are off, both axes
     counted: Floats  # (n,) and counts
     loglik: Floats  # (n,)
@@ -267,7 +267,7 @@ def _smoothed(
         P0[:, TURN] = 1.0
         turn = {"turn": rows.turn.size, "stay": rows.turn.keep, "q_turn": rows.turn.q}
     return _Smoothed(
-        **{"P": None, "squares": None}
+        **{"P": np.empty(0), "squares": np.empty(0)}
         | _core.drive_smooth(
             offsets=rows.offsets,
             order=rows.order,
@@ -363,7 +363,6 @@ def _learnt(rows: Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Floa
 
 def _fit(rows: Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain) -> Fit:
     part = slice(int(rows.offsets[i]), int(rows.offsets[i + 1]))
-    assert out.P is not None
     z, P = out.x[part, :SIZE].copy(), out.P[part, :SIZE, :SIZE]
     z[:, [E, N]] += rows.origin[i]
     east, north = z[:, E] + z[:, OFFSET_E], z[:, N] + z[:, OFFSET_N]
