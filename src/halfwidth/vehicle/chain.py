@@ -338,24 +338,18 @@ def _learnt(rows: Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Floa
     Rows where a sensor was silent are left out. One pseudo-row at the present value keeps a short drive from learning
     that it has no noise. The lateral residual is shared between its two groups by their present variances.
     """
-    own = s2[rows.drive]
-    parts = own[:, [LATERAL, SLIP]] * rows.weight2[:, [LATERAL, SLIP]]
-    whole = parts.sum(axis=1)
-    n = len(rows.origin)
+    aside = [LATERAL, SLIP]
+    own = s2[rows.drive][:, aside]
+    parts = own * rows.weight2[:, aside]
+    whole = parts.sum(axis=1, keepdims=True)
+    count, value = np.ones(squares.shape), squares.copy()
+    count[:, aside] = parts / whole
+    value[:, aside] *= parts * own / whole**2
+    value[:, OFFSET] *= share
+    keep = rows.counted & np.isfinite(squares)
+    total, counts = (np.add.reduceat(np.where(keep, one, 0.0), rows.offsets[:-1]) for one in (value, count))
     new = s2.copy()
-    for g, sensor in ((LONGITUDINAL, 0), (LATERAL, 1), (SLIP, 1), (YAW, 2), (OFFSET, -1), (DRIFT, -1)):
-        keep = ~rows.first & np.isfinite(squares[:, g])
-        if sensor >= 0:
-            keep &= ~rows.unknown[:, sensor]
-        of = rows.drive[keep]
-        counted = np.ones(of.size)
-        value = squares[keep, g]
-        if g in (LATERAL, SLIP):
-            counted = parts[keep, g - LATERAL] / whole[keep]
-            value = counted * own[keep, g] * value / whole[keep]
-        elif g == OFFSET:
-            value = value * share[keep]
-        new[:, g] = (np.bincount(of, value, n) + s2[:, g]) / (np.bincount(of, counted, n) + 1.0)
+    new[:, :FIX] = (total + s2[:, :FIX]) / (counts + 1.0)
     new[:, FIX] = (0.5 * out.misfit + s2[:, FIX]) / (out.counted + 1.0)
     new = np.where(np.isfinite(new), new, s2)
     return np.clip(new, _FLOOR**2, _CEILING**2)

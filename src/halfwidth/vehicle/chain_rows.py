@@ -30,7 +30,7 @@ class Rows:
     gap: Mask  # (R,) whether the step lies in a gap between fixes
     y: Floats  # (R, 2) fixes, about the first of each drive
     seen: Mask  # (R,)
-    unknown: Mask  # (R, 3) where a sensor was silent
+    counted: Mask  # (R, 6) whether the scales of the first six groups are learnt from a row: no sensor was silent there
     origin: Floats  # (n, 2)
     far: Floats  # (n,) how far the first node may be from the first fix, m
 
@@ -60,7 +60,8 @@ def rows_of(drives: Sequence[Grid]) -> Rows:
     # a step of unknown speed may also slide: without this the lateral row would trust a wrong displacement
     lost_speed, lost_yaw = h * all_of("speed_sd"), h * all_of("yaw_rate_sd")
     extra = np.column_stack((lost_speed**2, (0.02 * lost_speed) ** 2, lost_yaw**2))
-    unknown = extra > 0
+    spoke = (extra == 0) & ~first[:, None]
+    counted = np.column_stack((spoke[:, [0, 1, 1, 2]], ~first, ~first))
     turn = None
     if any(drive.has_yaw_rate and (drive.yaw_rate_sd > 0).any() for drive in drives):
         turn = joined([bridged(drive) for drive in drives])
@@ -89,7 +90,7 @@ def rows_of(drives: Sequence[Grid]) -> Rows:
         gap,
         y,
         seen,
-        unknown,
+        counted,
         origin,
         far,
     )

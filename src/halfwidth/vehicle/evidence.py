@@ -112,25 +112,31 @@ def integral(t: Floats, values: Floats, start: Floats, stop: Floats) -> Floats:
     A window that reaches beyond the samples, or over a pause of more than a second and three of
     the usual steps, gives NaN.
     """
+    return integrals(t, values, start, stop, np.zeros(1))[:, 0]
+
+
+def integrals(t: Floats, values: Floats, start: Floats, stop: Floats, late: Floats) -> Floats:
+    """Integrate a stream whose samples came so many seconds (L,) later, over windows (n,), as `integral`: (n, L)."""
+    out = np.full((start.size, late.size), np.nan)
     if t.size < 2:
-        return np.full(start.shape, np.nan)
+        return out
     step = np.diff(t)
     total = np.concatenate(([0.0], np.cumsum(step * (values[1:] + values[:-1]) / 2)))
     pause = np.concatenate(([0.0], np.cumsum(step > max(1.0, 3 * float(np.median(step))))))
-    out: Floats = _at(t, values, total, stop) - _at(t, values, total, start)
-    after = np.searchsorted(t, stop, side="left").clip(0, t.size - 1)
-    before = (np.searchsorted(t, start, side="right") - 1).clip(0, t.size - 1)
-    bad = (start < t[0]) | (stop > t[-1]) | (pause[after] != pause[before])
-    return np.where(bad, np.nan, out)
 
+    def upto(clock: Floats, k: NDArray[np.intp], when: Floats) -> Floats:  # the running integral between samples
+        k = k.clip(0, t.size - 2)
+        part = when - clock[k]
+        return np.asarray(total[k] + part * (values[k] + (values[k + 1] - values[k]) / step[k] * part / 2))
 
-def _at(t: Floats, values: Floats, total: Floats, when: Floats) -> Floats:
-    """Evaluate the running integral between samples."""
-    k = (np.searchsorted(t, when, side="right") - 1).clip(0, t.size - 2)
-    part = when - t[k]
-    slope = (values[k + 1] - values[k]) / (t[k + 1] - t[k])
-    value: Floats = total[k] + part * (values[k] + slope * part / 2)
-    return value
+    for i in range(late.size):
+        clock = t + late[i]
+        first, last = (np.searchsorted(clock, when, side="right") - 1 for when in (start, stop))
+        # a window that ends with a sample does not reach into the step after it
+        reached = np.where(clock[last] < stop, last + 1, last).clip(0, t.size - 1)
+        good = (start >= clock[0]) & (stop <= clock[-1]) & (pause[reached] == pause[first.clip(0)])
+        out[good, i] = (upto(clock, last, stop) - upto(clock, first, start))[good]
+    return out
 
 
 def _moving(log: Log, baselines: tuple[float, ...], least: float, *, swapped: bool = False) -> Windows | None:
