@@ -152,7 +152,7 @@ def test_table_of_gaps_has_every_gap():
             f"{gap.start:.1f}",
             f"{gap.stop:.1f}",
             f"{gap.duration_s:.1f}",
-            f"{gap.distance_m:.0f}",
+            f"{gap.distance_m:.{0 if gap.distance_m >= 10 else 1}f}",
             f"{gap.max_half_m:.2f}",
             gap.quality,
         ]

@@ -19,7 +19,7 @@ is shows in how fixes and dead reckoning disagree (`slow`): the messages name it
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from statistics import NormalDist
 from typing import Any
 
@@ -113,9 +113,9 @@ def fill(
     asked = with_limits(asked, limits, None) if held else asked
     known_roads = None if roads is None else roads_of(roads)
     beside = None if second is None else as_log(second)[0]
-    drive_log, native = as_log(log)
+    given, native = as_log(log)
     messages: list[str] = []
-    ready = prepared(drive_log, messages, None if clock_offset is None else offset, distrust=distrust, second=beside)
+    ready = prepared(given, messages, None if clock_offset is None else offset, distrust=distrust, second=beside)
     drive_log, grid, pieces, quality, t = ready.log, ready.grid, ready.pieces, ready.quality, ready.t
     if known_roads is not None:
         asked = with_limits(asked, limits, known_roads.local(grid.frame))
@@ -149,7 +149,7 @@ def fill(
         since_fix_s=since_fix_of(written, quality),
         level=level,
         method=chosen.name,
-        log=replace(drive_log, t=ready.stamps.back(drive_log.t)),
+        log=given,
         gaps=gaps,
         # where nothing could be tested, a model's own variance is a size and no probability
         guarantee="credible" if all(bridge.tested for bridge in answers.bridges) else "none",

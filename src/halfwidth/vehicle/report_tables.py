@@ -22,7 +22,7 @@ def gap_cells(track: Track, gap: Gap, number: int) -> list[str]:
         markup.moment(track, gap.start),
         markup.moment(track, gap.stop),
         f"{gap.duration_s:.1f}",
-        f"{gap.distance_m:,.0f}",
+        f"{gap.distance_m:,.{0 if gap.distance_m >= 10 else 1}f}",
         markup.metres(gap.max_half_m),
         markup.text(gap.quality),
     ]
