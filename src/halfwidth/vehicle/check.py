@@ -19,6 +19,7 @@ from halfwidth.vehicle import check_sensors, evidence
 from halfwidth.vehicle.align import calibrated, steps_of
 from halfwidth.vehicle.check_sensors import Item as Item
 from halfwidth.vehicle.distrust import NOTHING, Distrust, distrusted
+from halfwidth.vehicle.lapses import lapses, put_right
 from halfwidth.vehicle.log import STREAMS, Log
 from halfwidth.vehicle.sensors import Calibration
 from halfwidth.vehicle.spikes import spikes
@@ -211,6 +212,7 @@ def check(log: Any) -> Check:
     elif not isinstance(log, Log):
         log = from_frame(log, repair=False)
     leaping, log = _spikes(log)
+    lapsing, log = _lapses(log)
     swapped = _swapped(log)
     basis = None
     if swapped.verdict == "bad":
@@ -236,6 +238,7 @@ def check(log: Any) -> Check:
         _gaps(log),
         _pauses(log, () if basis is None else basis.stamps.leaps),
         leaping,
+        lapsing,
         swapped,
         *moving,
         *_steps(log, steps_of(log)),
@@ -327,6 +330,16 @@ def _spikes(log: Log) -> tuple[Item, Log]:
     said = "; ".join(words.removesuffix(": not used") for words in found.words(log))
     item = Item("spikes", "warn", said, float(len(found)), line=check_sensors.fill_line(log))
     return item, found.masked(log)
+
+
+def _lapses(log: Log) -> tuple[Item, Log]:
+    """Look for stretches in which speed or yaw rate contradict the fixes; return the log with them put right."""
+    found = lapses(log)
+    if not found:
+        return Item("lapses", "ok", "no stretch of the speed or yaw rate contradicts the fixes by a factor", 0.0), log
+    said = "; ".join(lapse.words(log) for lapse in found).replace(": put right", "").replace(": not used", "")
+    item = Item("lapses", "bad", said, float(len(found)), line=check_sensors.fill_line(log))
+    return item, put_right(log, found)
 
 
 def _swapped(log: Log) -> Item:

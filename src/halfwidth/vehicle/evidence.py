@@ -194,7 +194,7 @@ def turning(log: Log) -> Turning:
     if t.size < 2:
         return best
     for baseline in (1.0, 2.0, 4.0):
-        start, stop, turned = _turns(log, baseline)
+        start, stop, turned = turns(log, baseline)
         expected = -integral(t, rate, start, stop)
         known = np.isfinite(expected)
         expected, turned = expected[known], turned[known]
@@ -218,7 +218,7 @@ def _line(x: Floats, y: Floats) -> tuple[float, float]:
     return sxy / sxx, sxy / float(np.sqrt(sxx * syy)) if syy > 0 else 0.0
 
 
-def _turns(log: Log, baseline: float) -> tuple[Floats, Floats, Floats]:
+def turns(log: Log, baseline: float) -> tuple[Floats, Floats, Floats]:
     """Give changes of course between successive chords, from the middle of one to that of the next."""
     found = windows(log, baseline)
     far = found.distance >= max(3.0, 2.0 * baseline)

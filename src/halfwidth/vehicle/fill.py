@@ -34,6 +34,7 @@ from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, with_limits
 from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.grid import Grid, sampled
+from halfwidth.vehicle.lapses import lapses, put_right
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pieces import CONTEXT, Piece, pieces_of, spans_of, wanted_rows, with_pauses_filled
@@ -213,6 +214,9 @@ def prepared(
         leaps = spikes(log)
         messages.extend(leaps.words(log))
         log = leaps.masked(log)
+        lapsed = lapses(log)
+        messages.extend(lapse.words(log) for lapse in lapsed)
+        log = put_right(log, lapsed)
         # stray fixes show best against speed and yaw rate, later
         sensed = all(np.isfinite(getattr(log, name)).any() for name in ("speed_mps", "yaw_rate_radps"))
         doubtful = distrusted(log, jumps=not sensed)

@@ -76,6 +76,7 @@ def to_log(raw: Raw, *, repair: bool = True) -> Log:
     _positions(raw, streams, notes)
     rows = Rows(raw.source, t, streams, notes)
     rows.drop_untimed()
+    rows.unwrap()
     rows.drop_before_clock_was_set()
     rows.sort()
     rows.spread_coarse_stamps()
