@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth.vehicle import check_sensors, evidence
+from halfwidth.vehicle import adrift, check_sensors, evidence
 from halfwidth.vehicle.align import calibrated, steps_of
 from halfwidth.vehicle.check_sensors import Item as Item
 from halfwidth.vehicle.distrust import NOTHING, Distrust, distrusted
@@ -212,6 +212,7 @@ def check(log: Any) -> Check:
     elif not isinstance(log, Log):
         log = from_frame(log, repair=False)
     leaping, log = _spikes(log)
+    far, log = _adrift(log)
     lapsing, log = _lapses(log)
     swapped = _swapped(log)
     basis = None
@@ -238,6 +239,7 @@ def check(log: Any) -> Check:
         _gaps(log),
         _pauses(log, () if basis is None else basis.stamps.leaps),
         leaping,
+        far,
         lapsing,
         swapped,
         *moving,
@@ -330,6 +332,17 @@ def _spikes(log: Log) -> tuple[Item, Log]:
     said = "; ".join(words.removesuffix(": not used") for words in found.words(log))
     item = Item("spikes", "warn", said, float(len(found)), line=check_sensors.fill_line(log))
     return item, found.masked(log)
+
+
+def _adrift(log: Log) -> tuple[Item, Log]:
+    """Look for a clock of the sensors that is far off; return the log with them moved."""
+    seconds = adrift.adrift(log)
+    if seconds is None:
+        text = f"speed and fixes are within {adrift.NEAR:g} s of each other as far as stops and starts tell"
+        return Item("sensor clock", "ok", text, 0.0, "s"), log
+    said = adrift.words(seconds).removesuffix(": moved")
+    item = Item("sensor clock", "bad", f"{said}; fill moves them", seconds, "s", check_sensors.fill_line(log))
+    return item, adrift.moved(log, seconds)
 
 
 def _lapses(log: Log) -> tuple[Item, Log]:

@@ -28,6 +28,8 @@ from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle import proven, widening
+from halfwidth.vehicle.adrift import adrift, moved
+from halfwidth.vehicle.adrift import words as adrift_words
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.choice import Answers, estimated
 from halfwidth.vehicle.distrust import distrusted
@@ -214,6 +216,11 @@ def prepared(
         leaps = spikes(log)
         messages.extend(leaps.words(log))
         log = leaps.masked(log)
+    far = adrift(log) if offset is None else None
+    if far is not None:
+        messages.append(adrift_words(far))
+        log = moved(log, far)
+    if distrust:
         lapsed = lapses(log)
         messages.extend(lapse.words(log) for lapse in lapsed)
         log = put_right(log, lapsed)
