@@ -86,6 +86,34 @@ def test_a_speed_that_drops_to_0_among_fixes_or_in_a_gap_is_not_used(drive, firs
         assert wrong.t[[lapse.first, lapse.last]] == pytest.approx([first, last], abs=0.3)
 
 
+def test_a_speed_that_is_held_at_0_through_a_gap_and_leaps_at_its_end_is_not_used(drive):
+    truth, log = drive
+    inside = (log.t > 219.9) & (log.t < 240.0)  # the car stands as the gap begins: a receiver's own speed stays there
+    held = replace(log, speed_mps=np.where(inside, 0.0, log.speed_mps))
+    (lapse,) = lapses(held)
+    assert not lapse.right
+    assert held.t[lapse.last] == pytest.approx(240.0, abs=0.2)
+    assert (truth.speed_mps[lapse.first : lapse.last] > 1.0).mean() > 0.5
+
+
+def test_wheels_that_spin_in_a_gap_are_not_used(drive):
+    _, log = drive
+    wrong = times(log, "speed_mps", 2.0, 110.0, 113.0)
+    (lapse,) = lapses(wrong)
+    assert wrong.t[[lapse.first, lapse.last]] == pytest.approx([110.0, 113.0], abs=0.2)
+
+
+def test_a_speed_of_the_wrong_sign_is_turned(drive):
+    _, log = drive
+    wrong = replace(log, speed_mps=-log.speed_mps)
+    (lapse,) = lapses(wrong)
+    assert "negative all along" in lapse.words(wrong)
+    assert np.array_equal(put_right(wrong, [lapse]).speed_mps, log.speed_mps)
+    # a car that reverses out of a yard does go backwards
+    slow = (log.t > 60.0) & (log.t < 75.0)
+    assert lapses(replace(log, speed_mps=np.where(slow, -log.speed_mps, log.speed_mps))) == ()
+
+
 def test_a_car_that_halts_at_once_is_believed_where_its_fixes_say_so(drive):
     _, log = drive
     stands = (log.t > 150.0) & (log.t < 160.0)

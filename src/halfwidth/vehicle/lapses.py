@@ -58,8 +58,8 @@ _CONSTANT, _OFF, _SLOW = 0.12, 0.25, 3.0
 #: A leap is so many times what all but a hundredth of the changes are; so many changes say what is usual.
 _OFTEN, _CHANGES = 3.0, 50
 
-#: Fixes that move by less than this share of what the speed says on both sides stand.
-_HALF = 0.5
+#: A speed that leaps away comes back within so many seconds; nobody drives backwards this fast, m/s.
+_AWAY, _FORWARD = 30.0, 6.0
 
 #: Two states fit a window alike if they cost so little more.
 _ALIKE = 0.5
@@ -110,9 +110,11 @@ class Lapse:
         when = f"from {t[self.first]:.1f} s on" if self.last == len(log) - 1 else f"{t[self.last]:.1f} s"
         when = when if self.last == len(log) - 1 else f"from {t[self.first]:.1f} to {when}"
         if not self.reads:
-            moves = f"the car moves at {self.pace:.0f} m/s" if self.name == "speed_mps" else "the fixes turn"
+            moves = f"the car goes {self.pace:.0f} m/s" if self.name == "speed_mps" else "the fixes turn"
             return f"the {label} says {self.says:.3g} {when} while {moves}: not used"
         ratio = self.reads / self.rest
+        if self.name == "speed_mps" and ratio < 0:
+            return "the speed is negative all along, and no car drives backwards like that: taken as positive"
         what = "what the fixes say" if self.rest == 1 else "what it reads elsewhere, as the fixes show,"
         units = [f"in {name}" for size, name in _UNITS.items() if abs(np.log(abs(ratio) / size)) < 1e-6]
         units += [f"{name} elsewhere" for size, name in _UNITS.items() if abs(np.log(abs(ratio) * size)) < 1e-6]
@@ -134,11 +136,29 @@ def lapses(log: Log) -> tuple[Lapse, ...]:
         In order of time, those of the speed first; empty where the log lacks what tells.
     """
     believed = _without_repeats(log)
-    silent = _silent(believed)
-    believed = put_right(believed, silent)
+    turned = _backwards(believed)
+    believed = put_right(believed, turned)
+    leaping = _leaping(believed)
+    believed = put_right(believed, leaping)
     found = {name: _of(believed, name) for name in _FACTORS}
-    speed = sorted([*silent, *found["speed_mps"]], key=lambda lapse: lapse.first)
-    return (*speed, *found["yaw_rate_radps"])
+    speed = sorted([*leaping, *found["speed_mps"]], key=lambda lapse: lapse.first)
+    return (*turned, *speed, *found["yaw_rate_radps"])
+
+
+def _backwards(log: Log) -> list[Lapse]:
+    """Return the whole of a speed whose sign is wrong: no car drives backwards for most of its way, and fast."""
+    t, values = log.stream("speed_mps")
+    if t.size < _FEWEST:
+        return []
+    way = np.diff(t) * values[1:]
+    fast = np.abs(values) > 0.5 * float(np.quantile(np.abs(values), 0.99))
+    if not way.sum() < -0.5 * np.abs(way).sum() or not float(np.mean(values[fast] < 0)) > 0.9:
+        return []
+    seen = evidence.windows(log, max(1.0, float(np.median(np.diff(log.t[log.fixed])))))
+    pace = float(np.quantile(seen.distance / (seen.stop - seen.start), 0.9)) if seen.start.size else 0.0
+    if pace < _FORWARD:
+        return []
+    return [Lapse("speed_mps", 0, len(log) - 1, -1.0, 1.0, float(values[0]), pace, True)]
 
 
 def put_right(log: Log, found: Sequence[Lapse]) -> Log:
@@ -161,32 +181,77 @@ def _without_repeats(log: Log) -> Log:
     return replace(log, lat_deg=np.where(gone, np.nan, log.lat_deg), lon_deg=np.where(gone, np.nan, log.lon_deg))
 
 
-def _silent(log: Log) -> list[Lapse]:
-    """Return where the speed leaps to 0 and back, out of a car's reach, and no fixes say that the car stood."""
+def _leaping(log: Log) -> list[Lapse]:
+    """Return where the speed leaps away out of a car's reach and comes back, or says 0 and leaps, against the fixes.
+
+    Of a 0 that leaps at one end only and that fixes confirm elsewhere, what lies between that end and them is not used.
+    """
     name = "speed_mps"
     t, values = log.stream(name)
     if t.size < _FEWEST:
         return []
     row = matched_factor(evidence.speed_ratio(log))
     values = values * (row[2] if row is not None and row[3] == 1 else 1.0)
-    leap = np.abs(np.diff(values)) > LIMIT[name][0] + LIMIT[name][1] * np.diff(t) + BLIND[name]
-    falls = np.flatnonzero(leap & (values[1:] == 0)) + 1
-    changes = np.flatnonzero(np.diff(values) != 0) + 1
+    change = np.diff(values)
+    at = np.flatnonzero(np.abs(change) > LIMIT[name][0] + LIMIT[name][1] * np.diff(t) + BLIND[name]) + 1
+    new = np.flatnonzero(change != 0) + 1
+    fixes = log.t[log.fixed]
+    unseen = max(1.0, 2.0 * float(np.median(np.diff(fixes)))) if fixes.size > 1 else 1.0
     rows = np.flatnonzero(np.isfinite(getattr(log, name)))
-    found = []
-    for a in falls.tolist():
-        b = int(changes[min(int(np.searchsorted(changes, a, side="right")), changes.size - 1)])
-        if b <= a or not leap[b - 1]:
+    found: list[Lapse] = []
+    done = -1
+    for i, a in enumerate(at.tolist()):
+        if a <= done:
             continue
-        pace = float(min(abs(values[a - 1]), abs(values[b])))
-        inside = np.flatnonzero(log.fixed & (log.t >= t[a]) & (log.t < t[b]))
-        if inside.size > 1:
-            east, north = evidence.local_metres(log.lat_deg[inside], log.lon_deg[inside])
-            moved = float(np.hypot(east[-1] - east[0], north[-1] - north[0]))
-            if moved < _HALF * pace * float(log.t[inside[-1]] - log.t[inside[0]]):
-                continue
-        found.append(Lapse(name, int(rows[a]), int(rows[b - 1]), 0.0, 1.0, 0.0, pace, False))
+        before = values[a - 1]
+        ends = [b for b in at[i + 1 :].tolist() if t[b] - t[a] <= _AWAY]
+        ends = [
+            b for b in ends if change[a - 1] * change[b - 1] < 0 and abs(values[b] - before) < abs(change[a - 1]) / 2
+        ]
+        k = int(np.searchsorted(new, a))  # `new[k]` is `a`
+        if ends:
+            parts, pace = [(a, ends[0])], float(min(abs(before), abs(values[ends[0]])))
+        elif values[a] == 0:
+            stop = int(new[k + 1]) if k + 1 < new.size else t.size
+            parts, pace = [(a, stop), (a, min(stop, _before(t, fixes, a)))], abs(float(before))
+        elif before == 0:
+            first = int(new[k - 1]) if k else 0
+            parts, pace = [(first, a), (max(first, _after(t, fixes, a)), a)], abs(float(values[a]))
+        else:
+            continue
+        if _confirmed(log, t, values, *parts[0], pace):
+            # what no fix sees may be wrong nevertheless
+            parts = [(b, c) for b, c in parts[1:] if c > b and t[c - 1] - t[b] > unseen]
+        if not parts:
+            continue
+        first, stop = parts[0]
+        says = float(np.median(values[first:stop]))
+        found.append(Lapse(name, int(rows[first]), int(rows[stop - 1]), 0.0, 1.0, says, pace, False))
+        done = stop
     return found
+
+
+def _before(t: Floats, fixes: Floats, a: int) -> int:
+    """Return the first sample that is not before the first fix from sample a on."""
+    k = int(np.searchsorted(fixes, t[a]))
+    return int(np.searchsorted(t, fixes[k])) if k < fixes.size else t.size
+
+
+def _after(t: Floats, fixes: Floats, a: int) -> int:
+    """Return the first sample after the last fix before sample a."""
+    k = int(np.searchsorted(fixes, t[a])) - 1
+    return int(np.searchsorted(t, fixes[k], side="right")) if k >= 0 else 0
+
+
+def _confirmed(log: Log, t: Floats, values: Floats, first: int, stop: int, pace: float) -> bool:
+    """Return whether the fixes beside some samples move as these say, and not at a pace."""
+    inside = np.flatnonzero(log.fixed & (log.t >= t[first]) & (log.t <= t[stop - 1]))
+    if inside.size < 2:
+        return False
+    east, north = evidence.local_metres(log.lat_deg[inside], log.lon_deg[inside])
+    took = float(log.t[inside[-1]] - log.t[inside[0]])
+    shown = float(np.hypot(east[-1] - east[0], north[-1] - north[0])) / took
+    return abs(shown - float(np.abs(values[first:stop]).mean())) < abs(shown - pace)
 
 
 @dataclass(frozen=True, eq=False)
