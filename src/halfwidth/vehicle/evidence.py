@@ -243,6 +243,8 @@ CONVENTIONS: Mapping[str, Callable[[Floats], Floats]] = {
     "degrees counter-clockwise from east": lambda a: np.pi / 2 - np.radians(a),
     "radians counter-clockwise from north": lambda a: -a,
     "degrees counter-clockwise from north": lambda a: -np.radians(a),
+    "radians clockwise from south": lambda a: a + np.pi,
+    "degrees clockwise from south": lambda a: np.radians(a) + np.pi,
 }
 
 
@@ -318,3 +320,30 @@ def impossible_fixes(t: Floats, lat_deg: Floats, lon_deg: Floats, top_speed: flo
         else:
             out[edges[k] : edges[k + 1]] = True
     return out
+
+
+def spans(flagged: NDArray[np.bool_]) -> list[slice]:
+    """Return the runs of neighbours that are flagged."""
+    edge = np.diff(np.concatenate(([0], flagged.astype(np.int8), [0])))
+    return [slice(a, b) for a, b in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True)]
+
+
+def times_of(t: Floats, flagged: NDArray[np.bool_], off: Floats | None = None) -> str:
+    """Say when neighbours (n,) are flagged, and by up to how many metres each run is off, the first five runs."""
+    said = []
+    runs = spans(flagged)
+    for run in runs[:5]:
+        first, last = float(t[run][0]), float(t[run][-1])
+        when = f"{first:.1f}" if first == last else f"{first:.1f} to {last:.1f}"
+        most = 0.0 if off is None else float(off[run].max())
+        said.append(when if off is None else f"{when} s by up to {most:{'.0f' if most > 100 else '.2g'}} m")
+    return ", ".join(said) + (", ..." if len(runs) > 5 else "") + (" s" if off is None else "")
+
+
+def off_line(t: Floats, lat_deg: Floats, lon_deg: Floats, flagged: NDArray[np.bool_]) -> Floats:
+    """Return how far fixes (n,) are off the straight line in time between those that are not flagged, m."""
+    east, north = local_metres(lat_deg, lon_deg)
+    kept = ~flagged
+    if not kept.any():
+        return np.zeros(t.size)
+    return np.hypot(east - np.interp(t, t[kept], east[kept]), north - np.interp(t, t[kept], north[kept]))
