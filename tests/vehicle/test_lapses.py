@@ -137,6 +137,15 @@ def test_a_channel_that_never_changes_is_named(drive, name, value):
     assert not np.isfinite(getattr(put_right(dead, [lapse]), name)).any()
 
 
+def test_a_yaw_rate_that_is_none_of_this_car_is_not_used(drive):
+    _, log = drive
+    rng = np.random.default_rng(3)
+    for rate in (0.02 * rng.standard_normal(len(log)), np.clip(log.yaw_rate_radps, -0.05, 0.05)):
+        (lapse,) = lapses(replace(log, yaw_rate_radps=rate))
+        assert "does not follow the turns" in lapse.words(log)
+        assert not np.isfinite(put_right(log, [lapse]).yaw_rate_radps).any()
+
+
 def test_a_car_that_stands_has_no_lapse():
     rng = np.random.default_rng(1)
     n = 600

@@ -58,6 +58,10 @@ _CONSTANT, _OFF, _SLOW = 0.12, 0.25, 3.0
 #: A leap is so many times what all but a hundredth of the changes are; so many changes say what is usual.
 _OFTEN, _CHANGES = 3.0, 50
 
+#: A turn is so much, rad, and so many times as large as it is uncertain; a yaw rate that contradicts such a share of
+#: them is none of this car.
+_TURN, _TURN_SIZES, _AGAINST = 0.25, 2.5, 0.6
+
 #: A speed that leaps away comes back within so many seconds; nobody drives backwards this fast, m/s.
 _AWAY, _FORWARD = 30.0, 6.0
 
@@ -79,7 +83,7 @@ class Lapse:
     first, last : int
         Its first and last row.
     reads : float
-        What it reads of the truth in the stretch; 0 if it is silent.
+        What it reads of the truth in the stretch; 0 if it is silent, NaN if it has nothing to do with it.
     rest : float
         What it reads elsewhere.
     says : float
@@ -109,6 +113,8 @@ class Lapse:
         label, t = _NAMES[self.name], log.t
         when = f"from {t[self.first]:.1f} s on" if self.last == len(log) - 1 else f"{t[self.last]:.1f} s"
         when = when if self.last == len(log) - 1 else f"from {t[self.first]:.1f} to {when}"
+        if np.isnan(self.reads):
+            return f"the {label} does not follow the turns that the fixes show: not used"
         if not self.reads:
             moves = f"the car goes {self.pace:.0f} m/s" if self.name == "speed_mps" else "the fixes turn"
             return f"the {label} says {self.says:.3g} {when} while {moves}: not used"
@@ -292,6 +298,11 @@ def _of(log: Log, name: str) -> list[Lapse]:
     # in degrees a rate leaps in each turn
     leaps = (not seen.turning) & (np.searchsorted(t[leap + 1], to, side="right") > np.searchsorted(t[leap], from_))
     state = _course(cost, np.where(leaps, _LEAP, _CHANGE))
+    turns = np.abs(seen.shown) > np.maximum(_TURN, _TURN_SIZES * seen.size)
+    wrong = cost[np.arange(state.size), state][turns] > 0.5 * _MOST
+    if seen.turning and wrong.size >= 2 * _STRETCH and wrong.mean() > _AGAINST:
+        pace = float(np.median(np.abs(seen.shown)))
+        return [Lapse(name, 0, len(log) - 1, float("nan"), 1.0, float(values[0]), pace, False)]
     share = np.bincount(state, minlength=factors.size)
     usual = int(np.argmax(np.where(np.isfinite(factors) & (factors != 0), share, -1)))
     cuts = np.flatnonzero(np.diff(state)) + 1
