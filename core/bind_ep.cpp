@@ -555,6 +555,7 @@ class EpFrame {
             a.out = outliers ? take(abreast * rows) : nullptr;
             bounds.x = a.x;
             bounds.P = a.P;
+            bounds.k3 = a.k3;
             l.centre = take(stages * n);
             l.value = take(nodes);
             l.share = take(nodes);

@@ -142,8 +142,10 @@ int learn(N n, const EpLearnArgs& a) {
     learner.lead = learner.keep_nu + a.base.rows;  // 2 * sites * parameters
     if (!a.outside) return learner.run();
     place.p += (2 * std::size_t(size + a.base.rows) * (1 + learner_parameters(a)) + wide_lanes - 1) / wide_lanes;
-    Ep<N> outside{n, *a.outside, {0, wide_lanes - 1}, {}, {}, 0};
+    Ep<N> outside{n, *a.outside, {0, wide_lanes - 1}, {}, {}, a.base.T + 1};
     settle_in(outside, learner.fo, place);
+    learner.around = outside.cross;
+    outside.cross = EpCross{};
     learner.outside = &outside;
     return learner.run();
 }

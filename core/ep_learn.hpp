@@ -17,7 +17,8 @@
 //
 // Bounds as a factor count as an event that small half-widths make likely: within few rows that keeps half-widths from
 // growing until bounds alone shape the path, over hundreds it shrinks them. So Z(phi) is divided by a power, `condition`,
-// of the evidence of the chain with its bounds alone (`outside`): with the power 1 bounds are a condition.
+// of the evidence of the chain with its bounds alone (`outside`), to second order as well: with the power 1 bounds are a
+// condition.
 #pragma once
 
 #include "ep.hpp"
@@ -44,6 +45,7 @@ struct EpLearner {
     double *keep_m = nullptr, *keep_D = nullptr, *keep_tau = nullptr, *keep_nu = nullptr;  // sites of the best point
     Ep<N>* outside = nullptr;       // bounds alone, or null
     EpFound fo{};
+    EpCross around{};               // what their second order needs
     int q = 0;                                // parameters
     int group[ep_free] = {};                  // half-width of a parameter, -1: the rate
     double lo[ep_free] = {}, hi[ep_free] = {};
@@ -688,6 +690,7 @@ struct EpLearner {
         evaluate_inside(at, a.most, a.tol_nodes, value, slope, begin, false);
         if (now.count > 1) hold(k, at);
         const V more = ep.second(a.base.k3, a.base.k4);
+        const V less = outside ? V(a.condition) * outside->second(nullptr, nullptr) : V(0.0);
         for (int l = 0; l < wide_lanes && k + l < end; l++) {
             for (int j = 0; j < q; j++) {
                 a.phi[(k + l) * q + j] = at[l][j];
@@ -695,7 +698,8 @@ struct EpLearner {
             }
             a.second[k + l] = finite(more[l]) ? more[l] : 0.0;  // so sharp a box that its cumulants overflow
             a.residuals[k + l] = f.residual[l];
-            a.value[k + l] = inside[l] && value[l] > minus_inf ? value[l] + a.second[k + l] : minus_inf;
+            const double corrected = value[l] + a.second[k + l] - (finite(less[l]) ? less[l] : 0.0);
+            a.value[k + l] = inside[l] && value[l] > minus_inf ? corrected : minus_inf;
         }
     }
 
@@ -802,6 +806,7 @@ struct EpLearner {
         }
         const int nodes = alone(H) ? 1 : a.nodes;
         ep.cross = wanted;
+        if (outside) outside->cross = around;
         const std::ptrdiff_t size = stage_count();
         for (std::ptrdiff_t k = 0; k < size; k++) a.x[k] = a.k3[k] = a.k4[k] = 0.0;
         for (std::ptrdiff_t k = 0; k < size * ep.n; k++) a.P[k] = 0.0;

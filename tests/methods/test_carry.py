@@ -331,6 +331,50 @@ def test_the_evidence_of_bounds_alone():
     assert inside(sites(system(UNKNOWN, UNKNOWN), record), s).precision.any() == np.False_
 
 
+GRID = np.linspace(-1.0, 1.0, 4001)
+
+
+def evidence_on_a_grid(q, T, y=None):
+    """Return log p(y, inside), or log P(inside), of x' = x / 2 + w between -1 and 1, |w| <= q and |y - x| <= 1/2."""
+    dx, density, total = GRID[1] - GRID[0], np.full(GRID.size, 0.5), 0.0
+
+    def mass(values):
+        return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * dx)])
+
+    for t in range(T):
+        below = mass(density)
+        density = (np.interp(2 * (GRID + q), GRID, below) - np.interp(2 * (GRID - q), GRID, below)) / (2 * q)
+        if y is not None:
+            density = density * (np.abs(GRID - y[t]) <= 0.5)
+        share = mass(density)[-1]
+        total, density = total + np.log(share), density / share
+    return total
+
+
+def test_the_evidence_of_bounds_alone_has_its_second_order():
+    q, one = 0.8, hw.Box(-1, 1)
+    model = hw.Linear([[0.5]], None, [[1]], hw.Uniform.unknown(at_most=5.0), hw.Uniform(0.5), one, bounds=one)
+    known = inside(sites(model, hw.Record(np.arange(1.0, 41.0), np.zeros((40, 1)))), np.array([q, 0.5]))
+    slope = known.pull[0] - known.precision[0, 0] * q
+    exact = (evidence_on_a_grid(1.01 * q, 40) - evidence_on_a_grid(0.99 * q, 40)) / (0.02 * q)
+    assert slope == pytest.approx(exact, rel=0.02)
+
+
+def test_many_rows_between_bounds_have_the_evidence_that_they_have():
+    rng, x, path, one = np.random.default_rng(0), 0.0, [], hw.Box(-1, 1)
+    while len(path) < 60:
+        new = 0.5 * x + rng.uniform(-0.8, 0.8)
+        if abs(new) < 1:
+            x = new
+            path.append(x)
+    y = np.array(path) + rng.uniform(-0.5, 0.5, 60)
+    model = hw.Linear([[0.5]], None, [[1]], hw.Uniform(0.8), hw.Uniform(0.5), one, bounds=one)
+    est = hw.estimate(model, hw.Record(np.arange(1.0, 61.0), y[:, None]), hw.Posterior())
+    # bounds count as a factor in 26 rows, and as a condition in the others
+    exact = evidence_on_a_grid(0.8, 60, y) - (1 - 26 / 60) * evidence_on_a_grid(0.8, 60)
+    assert est.loglik == pytest.approx(exact, abs=0.2)
+
+
 def test_a_forecast_has_outputs():
     _, record = drawn(60, 3)
     F = np.array([[1, 0.4], [0, 1]])

@@ -18,7 +18,8 @@ a row.
 As a factor of the evidence bounds count as an event that small half-widths make likely, and over many windows that adds
 up. So they are a condition in all rows but 26, those of the newest window and those that have left alike
 (`condition`): a quadratic of log P(inside | s), the evidence of the chain with its bounds alone, is taken off. It is
-found anew in every N-th window.
+found anew in every N-th window. Its slope has what expectation propagation leaves out to second order: the windows'
+evidence has it, and the difference would add up over many windows.
 
 The state before the first row of a window is what the sites of the rows that have left make of it: the forwards message
 of expectation propagation, a Gaussian.
@@ -121,7 +122,7 @@ class Known:
 
 
 def inside(chain: Sites, s: Array) -> Known:
-    """Return the logarithm of the evidence of the bounds alone, to second order about half-widths s (p,)."""
+    """Return the logarithm of the evidence of the bounds alone as a quadratic about half-widths s (p,)."""
     known, problem = Known.none(len(s)), chain.outside
     free = np.flatnonzero(chain.free)
     if problem is None or not free.size:
@@ -137,8 +138,10 @@ def inside(chain: Sites, s: Array) -> Known:
         return known
     s = s[free]
     H = -(0.5 * (column + column.T) - np.diag(g[0])) / (s[:, None] * s)
+    more = (found["second"][1 : q + 1] - found["second"][q + 1 :]) / (2.0 * h)
+    more[~np.isfinite(more)] = 0.0  # so sharp a box that its cumulants overflow
     known.precision[np.ix_(free, free)] = H
-    known.pull[free] = g[0] / s + H @ s
+    known.pull[free] = (g[0] + more) / s + H @ s
     return known
 
 
