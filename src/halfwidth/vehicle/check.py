@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth.vehicle import adrift, check_sensors, evidence
+from halfwidth.vehicle import check_sensors, evidence
 from halfwidth.vehicle.align import calibrated, steps_of
 from halfwidth.vehicle.check_sensors import Item as Item
 from halfwidth.vehicle.distrust import NOTHING, Distrust, distrusted
-from halfwidth.vehicle.lapses import lapses, put_right
 from halfwidth.vehicle.log import STREAMS, Log
 from halfwidth.vehicle.sensors import Calibration
 from halfwidth.vehicle.spikes import spikes
@@ -213,8 +212,8 @@ def check(log: Any) -> Check:
     elif not isinstance(log, Log):
         log = from_frame(log, repair=False)
     leaping, log = _spikes(log)
-    far, log = _adrift(log)
-    lapsing, log = _lapses(log)
+    far, log = check_sensors.far_clock(log)
+    lapsing, log = check_sensors.lapsing(log)
     swapped = _swapped(log)
     basis = None
     if swapped.verdict == "bad":
@@ -336,27 +335,6 @@ def _spikes(log: Log) -> tuple[Item, Log]:
     return item, found.masked(log)
 
 
-def _adrift(log: Log) -> tuple[Item, Log]:
-    """Look for a clock of the sensors that is far off; return the log with them moved."""
-    seconds = adrift.adrift(log)
-    if seconds is None:
-        text = f"speed and fixes are within {adrift.NEAR:g} s of each other as far as stops and starts tell"
-        return Item("sensor clock", "ok", text, 0.0, "s"), log
-    said = adrift.words(seconds).removesuffix(": moved")
-    item = Item("sensor clock", "bad", f"{said}; fill moves them", seconds, "s", check_sensors.fill_line(log))
-    return item, adrift.moved(log, seconds)
-
-
-def _lapses(log: Log) -> tuple[Item, Log]:
-    """Look for stretches in which speed or yaw rate contradict the fixes; return the log with them put right."""
-    found = lapses(log)
-    if not found:
-        return Item("lapses", "ok", "no stretch of the speed or yaw rate contradicts the fixes by a factor", 0.0), log
-    said = "; ".join(lapse.words(log) for lapse in found).replace(": put right", "").replace(": not used", "")
-    item = Item("lapses", "bad", said, float(len(found)), line=check_sensors.fill_line(log))
-    return item, put_right(log, found)
-
-
 def _swapped(log: Log) -> Item:
     name = "latitude, longitude"
     if swapped_columns(log):
@@ -391,7 +369,7 @@ def _outliers(log: Log) -> Item:
     return Item(
         "outliers",
         "bad" if share > 0.05 else "warn",
-        f"{int(bad.sum())} of {bad.size} fixes jump further than a speed of {top:.0f} m/s explains, {when}",
+        f"{int(bad.sum())} of {bad.size} fixes jump further than a speed of {top:.0f} m/s explains, at {when}",
         float(bad.sum()),
         line=check_sensors.fill_line(log),
     )

@@ -446,11 +446,11 @@ def _impossible(log: Log, notes: list[str]) -> Log:
     off = evidence.off_line(t, lat, lon, bad)
     when = evidence.times_of(t, bad, off)
     if bad.mean() > 0.2:
-        notes.append(f"{int(bad.sum())} of {bad.size} fixes lie where no car gets in the time, {when}: kept")
+        notes.append(f"{int(bad.sum())} of {bad.size} fixes lie where no car gets in the time, at {when}: kept")
         return log
     gone = np.zeros(len(log), dtype=bool)
     gone[rows[bad]] = True
-    notes.append(f"{counted(int(bad.sum()), 'fix')} dropped that no car could reach, {when}")
+    notes.append(f"{counted(int(bad.sum()), 'fix')} dropped that no car could reach, at {when}")
     changed: dict[str, Any] = {
         name: np.where(gone, np.nan, getattr(log, name)) for name in ("lat_deg", "lon_deg", "alt_m", "azimuth_rad")
     }
