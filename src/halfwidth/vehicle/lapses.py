@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from halfwidth.vehicle import evidence
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.spikes import BLIND, LIMIT
-from halfwidth.vehicle.units import FACTOR_NEAR, matched_factor
+from halfwidth.vehicle.units import FACTOR_NEAR, contradicted_yaw, matched_factor
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -250,14 +250,41 @@ def _after(t: Floats, fixes: Floats, a: int) -> int:
 
 
 def _confirmed(log: Log, t: Floats, values: Floats, first: int, stop: int, pace: float) -> bool:
-    """Return whether the fixes beside some samples move as these say, and not at a pace."""
+    """Return whether the fixes beside some samples move as these say, and not at a pace.
+
+    Where there are none, those around them are asked how far the way along the yaw rate leads from one to the other.
+    """
     inside = np.flatnonzero(log.fixed & (log.t >= t[first]) & (log.t <= t[stop - 1]))
     if inside.size < 2:
-        return False
+        return _nearer(log, t, values, first, stop, pace)
     east, north = evidence.local_metres(log.lat_deg[inside], log.lon_deg[inside])
     took = float(log.t[inside[-1]] - log.t[inside[0]])
     shown = float(np.hypot(east[-1] - east[0], north[-1] - north[0])) / took
     return abs(shown - float(np.abs(values[first:stop]).mean())) < abs(shown - pace)
+
+
+def _nearer(log: Log, t: Floats, values: Floats, first: int, stop: int, pace: float) -> bool:
+    """Return whether dead reckoning between the fixes around some samples comes nearer with them than at a pace."""
+    fixes = np.flatnonzero(log.fixed)
+    a, b = int(np.searchsorted(log.t[fixes], t[first])) - 1, int(np.searchsorted(log.t[fixes], t[stop - 1]))
+    if a < 0 or b >= fixes.size:
+        return False
+    ends = fixes[[a, b]]
+    east, north = evidence.local_metres(log.lat_deg[ends], log.lon_deg[ends])
+    apart = float(np.hypot(east[1] - east[0], north[1] - north[0]))
+    when = np.linspace(log.t[ends[0]], log.t[ends[1]], 2 + int(10 * (log.t[ends[1]] - log.t[ends[0]])))
+    clock, rate = log.stream("yaw_rate_radps")
+    factor = contradicted_yaw(evidence.turning(log)) or 1.0
+    turning = np.interp(when, clock, rate) * factor if clock.size else np.zeros(when.size)
+    step = np.diff(when)
+    azimuth = np.concatenate(([0.0], np.cumsum(step * 0.5 * (turning[1:] + turning[:-1]))))
+    speed = np.abs(np.interp(when, t, values))
+    at_pace = np.where((when >= t[first]) & (when <= t[stop - 1]), pace, speed)
+    off = []
+    for v in (speed, at_pace):
+        way = v * np.exp(1j * azimuth)
+        off.append(abs(abs(complex(np.sum(step * 0.5 * (way[1:] + way[:-1])))) - apart))
+    return off[0] < off[1]
 
 
 @dataclass(frozen=True, eq=False)
