@@ -18,7 +18,8 @@ from halfwidth.methods.map import BatchLP
 from halfwidth.methods.window import window_chain
 from halfwidth.reproduce import paper003
 from halfwidth.result import Status
-from halfwidth.solvers.banded import Chain, solve
+from halfwidth.solvers.banded import solve
+from halfwidth.solvers.chain import Chain
 from halfwidth.solvers.stock import PIQP, highs
 
 H = 0.1

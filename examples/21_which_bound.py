@@ -35,6 +35,18 @@ def main():
     lo, hi = learned.interval(0.9, of=[1, 1])
     print(f"\nx0 + x1 at the last row: {lo[-1, 0]:.2f} to {hi[-1, 0]:.2f}, truth {truth.x[-1].sum():.2f}")
 
+    # And any functional of several rows: it is a state of its own, here the mean of x0 over the outage.
+    def E(t):
+        return [[1, -1 / 11 if 120 <= t <= 130 else 0, 0], [0, 1, 0], [0, 0, 1]]
+
+    summing = hw.Linear(
+        [[1, 0, 0], [0, *A[0]], [0, *A[1]]], None, np.c_[[0, 0], C], hw.Uniform.unknown(at_most=[0, 5, 5]), unknown,
+        hw.Box([0, -1, -1], [0, 1, 1]), E=E,
+    )  # fmt: skip
+    lo, hi = hw.estimate(summing, record).interval(0.9)
+    mean = truth.x[(record.t >= 120) & (record.t <= 130), 0].mean()
+    print(f"mean of x0 over the outage: {lo[-1, 0]:.2f} to {hi[-1, 0]:.2f}, truth {mean:.2f}")
+
     models = {
         "bounded noise": asked,
         "no state noise": hw.Linear(A, None, C, hw.Uniform(0.0), unknown, hw.Box(-1, [1, 1])),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from halfwidth.solvers.banded import Chain
+from halfwidth.solvers.chain import Chain
 
 KINDS = (
     "plain", "missing", "box", "theta", "scale", "zero", "T1", "unseen", "caps", "infeasible", "E", "varying", "weights",

@@ -66,7 +66,8 @@ class Twin:
         local = dataclasses.replace(model, **changes)
         known = self.known(a, len(record), inside)
         if isinstance(model, hw.Nonlinear):
-            answer = relinearised(window.method, local, record, s=None if start is None else start.s, known=known)
+            s = None if start is None else start.s
+            answer = relinearised(window.method, local, record, s=s, known=known, path=self.path(a, u, dt))
         else:
             shaped = max(len(record) - window.lag, 0)
             answer = window.method.answer(local, record, start=start, drop=drop, known=known, frames={}, shaped=shaped)
@@ -78,6 +79,14 @@ class Twin:
         else:
             assert len(carried.waiting) <= waiting
         return answer, estimate
+
+    def path(self, a, u, dt):
+        """Return the stream's newest states from the one before row a on, and what follows them."""
+        held = self.live._core._rows.held
+        new = self.model.move(held.x[-1], u, dt)
+        if isinstance(self.model.bounds, hw.Box):
+            new = np.clip(new, self.model.bounds.lo, self.model.bounds.hi)
+        return np.concatenate([held.x[a - held.first :], new[None]])
 
     def known(self, a, rows, inside):
         """Return what windows tell all of whose rows have left, faded since they left."""

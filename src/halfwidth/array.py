@@ -1,6 +1,6 @@
 """Checked conversion of what users pass into float64 arrays; the only place where input arrays are judged."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -144,3 +144,12 @@ def times(value: ArrayLike, name: str = "t") -> Array:
 
 
 Function = Callable[..., ArrayLike]
+
+
+def wrapped(difference: Array, angles: Sequence[int]) -> Array:
+    """Return differences (..., n) with the entries that are angles in radians wrapped to a turn about 0."""
+    if not len(angles):
+        return difference
+    out, k = np.array(difference), list(angles)
+    out[..., k] = (out[..., k] + np.pi) % (2 * np.pi) - np.pi
+    return out

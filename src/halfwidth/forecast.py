@@ -25,7 +25,7 @@ def forecast(
     dt: float | None = None,
     method: Any = None,
 ) -> Estimate:
-    """Estimate the states, and for a linear model the outputs, of the rows after a record.
+    """Estimate the states and the outputs of the rows after a record.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def forecast(
     -------
     Estimate
         Of the new rows only; ``info["y"]`` (steps, ny) and ``info["S"]`` (steps, ny, ny) are mean and covariance of
-        their outputs where the spread has a covariance and the model is linear.
+        their outputs where the spread has a covariance; a nonlinear output is that of the mean state.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def forecast(
     est = estimate(model, longer, method)
     s = slice(len(record), len(longer))
     info: dict[str, Any] = {"message": est.message, "n_seen": int(record.seen.sum())}
-    if isinstance(model, Linear) and est.P is not None and est.status.good:
+    if est.P is not None and est.status.good:
         y, S = foretold(model, est, longer)
         info |= {"y": y[s], "S": S[s]}
     return Estimate(

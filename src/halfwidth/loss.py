@@ -10,7 +10,7 @@ as NaN. Row by row, each sensor either delivers ``C x[t] + e[t]`` or, unflagged,
 ====================  ===========================================================================================
 
 Sensors are groups of outputs that are lost together; all outputs are one sensor unless `received` has an entry each.
-In the kernel a loss process is a set of modes, one per pattern of sensor states, each with its own C, offset and R.
+What the kernel makes of a loss process is in `halfwidth.methods._loss_modes`.
 
 References
 ----------
@@ -20,7 +20,7 @@ References
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,18 +33,6 @@ KINDS = ("noise", "stale", "garbage")
 #: Covariance of a lost sample relative to the diagonal of R, where `noise` is absent.
 _STALE, _GARBAGE = 1e-6, 1e4
 _MOST_MODES = 64
-
-
-class Modes(NamedTuple):
-    """A loss process as the kernel sees it, for the T rows of one record and M modes."""
-
-    C: Array  # (1 or T, M, ny, nx)
-    d: Array | None  # (1 or T, M, ny)
-    R: Array  # (1 or T, M, ny, ny)
-    Pi: Array  # (1 or T, M, M)
-    pi0: Array  # (M,)
-    prior: Array | None  # (G, 2, 2) pseudo-counts of a law to be learned
-    carries: NDArray[np.bool_]  # (M, ny) whether an output carries the state
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,58 +111,6 @@ class _Loss:
             raise BadShape(f"`noise` of the loss has shape {given.shape}, ({ny}, {ny}) was expected from the model")
         return np.broadcast_to(given, R.shape)
 
-    def modes(self, C: Array, R: Array, y: Array, seen: NDArray[np.bool_]) -> Modes:
-        """Return the modes of a record.
-
-        Parameters
-        ----------
-        C : (1 or T, ny, nx) array
-        R : (1 or T, ny, ny) array
-            Covariance of received outputs, positive definite.
-        y : (T, ny) array
-        seen : (T, ny) bool array
-        """
-        T, ny = y.shape
-        groups = self.groups(ny)
-        patterns = self.patterns(len(groups))
-        owner = np.empty(ny, dtype=int)
-        for g, members in enumerate(groups):
-            owner[list(members)] = g
-        state = patterns[:, owner]  # (M, ny)
-        received = state == len(self.kind)
-        carries = received.copy()
-        lost = {kind: state == k for k, kind in enumerate(self.kind)}
-        if "garbage" in lost:
-            carries |= lost["garbage"]
-        Cm = np.where(carries[:, :, None], C[:, None], 0.0)
-        both = received[:, :, None] & received[:, None, :]
-        Rm = np.where(both, R[:, None], 0.0)
-        for kind, where in lost.items():
-            pair = where[:, :, None] & where[:, None, :]
-            if (
-                kind == "noise" and self.noise is None and "noise" not in self.noise_of
-            ):  # the same noise, whether or not the sample is in it
-                pair |= (where | received)[:, :, None] & (where | received)[:, None, :]
-            Rm = np.where(pair, self.cov(kind, R)[:, None], Rm)
-        d: Array | None = None
-        if "noise" in lost and np.any(self.center != 0.0):
-            d = np.where(lost["noise"], self.center, 0.0)[None]
-        Pi, pi0 = self.chain(T, len(groups))
-        if "stale" in lost:
-            last = last_reported(y, seen)
-            d = np.where(lost["stale"], np.nan_to_num(last)[:, None, :], 0.0 if d is None else d)
-            unable = (np.isnan(last) & seen)[:, None, :] & lost["stale"]  # nothing was reported yet
-            Pi, pi0 = _without(Pi, pi0, unable.any(axis=2))
-        return Modes(
-            np.ascontiguousarray(Cm),
-            None if d is None else np.ascontiguousarray(d),
-            np.ascontiguousarray(Rm),
-            np.ascontiguousarray(Pi),
-            np.ascontiguousarray(pi0),
-            self.prior_counts(len(groups)),
-            carries,
-        )
-
     def chain(self, T: int, n_sensors: int) -> tuple[Array, Array]:
         """Return transition probabilities (1 or T, M, M) of the modes and their first probabilities (M,)."""
         between, first = self.sensor_chain()
@@ -212,8 +148,8 @@ class _Loss:
         S, G = between.shape[-1], len(groups)
         v = e
         if isinstance(model, Linear) and model.F is not None:
-            F = model.F.stack(model.dt * np.arange(T, dtype=np.float64), np.full(T, model.dt))[0]
-            v = np.asarray(np.linalg.solve(np.broadcast_to(F, (T, ny, ny)), e[..., None])[..., 0], dtype=np.float64)
+            F = model.F.each(model.dt * np.arange(T, dtype=np.float64), np.full(T, model.dt))
+            v = np.asarray(np.linalg.solve(F, e[..., None])[..., 0], dtype=np.float64)
         R = np.cov(v.T).reshape(ny, ny) if T > 1 else np.eye(ny)
         draws = {kind: rng.multivariate_normal(np.zeros(ny), self.cov(kind, R), T, method="eigh") for kind in self.kind}
         if self.noise is None and "noise" in draws and "noise" not in self.noise_of:
@@ -349,6 +285,11 @@ class Markov(_Loss):
     kind, noise, center, sensors
         As for `Bernoulli`.
 
+    Raises
+    ------
+    BadShape, BadValue
+        If a probability is outside 0 to 1 or a shape does not fit.
+
     Examples
     --------
     >>> Markov(0.95, 0.85)
@@ -441,31 +382,6 @@ class Markov(_Loss):
 
 
 Loss = Bernoulli | Markov
-
-
-def last_reported(y: Array, seen: NDArray[np.bool_]) -> Array:
-    """Return for each entry of y (T, ny) the value reported last before it, NaN where there is none."""
-    T, ny = y.shape
-    row = np.where(seen, np.arange(T)[:, None], -1)
-    before = np.full((T, ny), -1)
-    before[1:] = np.maximum.accumulate(row, axis=0)[:-1]
-    values = np.take_along_axis(y, np.maximum(before, 0), axis=0)
-    return np.where(before >= 0, values, np.nan)
-
-
-def _without(Pi: Array, pi0: Array, unable: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Give the probability of modes that cannot be, (T, M), to the others."""
-    if not unable.any():
-        return Pi, pi0
-    Pi = np.array(np.broadcast_to(Pi, (len(unable), *Pi.shape[1:])))
-    able = ~unable
-    rest = np.where(able[:, None, :], Pi, 0.0)
-    total = rest.sum(axis=-1, keepdims=True)
-    Pi = np.where(
-        total > 0, rest / np.where(total > 0, total, 1.0), able[:, None, :] / able.sum(axis=-1)[:, None, None]
-    )
-    first = np.where(able[0], pi0, 0.0)
-    return Pi, first / first.sum() if first.sum() > 0 else able[0] / able[0].sum()
 
 
 def _together(law: Array, n_sensors: int, T: int) -> Array:

@@ -188,13 +188,7 @@ class Linear:
         Refused
             If half-widths are unknown or the prior box is infinite.
         """
-        return dataclasses.replace(
-            self,
-            w=_gaussian(self.w, "w"),
-            e=_gaussian(self.e, "e"),
-            x0=_normal(self.x0),
-            bounds=None,
-        )
+        return dataclasses.replace(self, **_matched(self))
 
     def __repr__(self) -> str:
         return _repr(self)
@@ -389,13 +383,7 @@ class Nonlinear:
 
     def as_gaussian(self) -> "Nonlinear":
         """Return the model with Gaussian noise of the same covariances; see `Linear.as_gaussian`."""
-        return dataclasses.replace(
-            self,
-            w=_gaussian(self.w, "w"),
-            e=_gaussian(self.e, "e"),
-            x0=_normal(self.x0),
-            bounds=None,
-        )
+        return dataclasses.replace(self, **_matched(self))
 
     def __repr__(self) -> str:
         return _repr(self)
@@ -525,6 +513,11 @@ def _names(given: Sequence[str] | Mapping[str, Sequence[str]] | Names | None, nx
             raise BadValue(f"`names` repeats a name of {key}: {found}")
         parts[key] = found
     return Names(**{key: tuple(parts[key]) for key in sizes})
+
+
+def _matched(model: Model) -> dict[str, Any]:
+    """Return what a model with Gaussian noise of the same covariances has instead."""
+    return {"w": _gaussian(model.w, "w"), "e": _gaussian(model.e, "e"), "x0": _normal(model.x0), "bounds": None}
 
 
 def _gaussian(noise: Noise, name: str) -> Gaussian:

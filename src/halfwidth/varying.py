@@ -85,6 +85,11 @@ class Varying:
         rows = [self.at(float(a), float(h)) for a, h in zip(t, dt, strict=True)]
         return np.array(rows).reshape(-1, *self.shape), None
 
+    def each(self, t: Array, dt: Array) -> Array:
+        """Return the matrix of each row, (T, rows, columns), which may be a view; see `stack`."""
+        stack, index = self.stack(t, dt)
+        return np.broadcast_to(stack, (len(t), *stack.shape[1:])) if index is None else stack[index]
+
     def at(self, t: float, dt: float, row: int = 0) -> Array:
         """Return the matrix (rows, columns) at one row."""
         if self.function is None:

@@ -9,7 +9,8 @@ from tests.naive_lp import central, dense, problem
 
 from halfwidth import _core
 from halfwidth.result import Status
-from halfwidth.solvers.banded import BANDED, Chain, solve
+from halfwidth.solvers.banded import BANDED, solve
+from halfwidth.solvers.chain import Chain
 from halfwidth.solvers.lp import solve as proved
 from halfwidth.solvers.program import Verdict
 from halfwidth.solvers.stock import HIGHS, PIQP

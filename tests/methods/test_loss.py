@@ -7,7 +7,7 @@ import pytest
 from tests import naive_loss as naive
 
 import halfwidth as hw
-from halfwidth.loss import last_reported
+from halfwidth.methods._loss_modes import last_reported
 from halfwidth.methods._loss_rows import linear_rows, outputs_and_modes
 from halfwidth.methods._loss_stream import LossStream
 from halfwidth.reproduce import paper001 as paper

@@ -77,3 +77,17 @@ def test_missing_rows_and_what_no_trajectory_fits():
     assert lp.evidence is None
     with pytest.raises(hw.BadValue, match="foretell"):
         hw.choose_memory(ASKED, hw.Record(record.t, np.full((40, 1), np.nan)), QUICK)
+
+
+@pytest.mark.parametrize("method", [hw.Posterior(nodes=8), hw.SequentialLP(rounds=1)], ids=repr)
+def test_of_a_nonlinear_model_errors_alone_choose(method):
+    bent = hw.Nonlinear(lambda x: 0.9 * np.sin(x), lambda x: x, UNKNOWN, UNKNOWN, hw.Box([-1], [1]))
+    wound = hw.Nonlinear(bent.g, bent.h, UNKNOWN, UNKNOWN, bent.x0, y_angles=(0,))
+    _, record = hw.simulate(WALK, T=24, seed=3)
+    plain, turned = (
+        hw.choose_memory(model, hw.Record(record.t, y), method, memories=(4, 8))
+        for model, y in ((bent, record.y), (wound, record.y + 2 * np.pi))
+    )
+    assert plain.evidence is None
+    assert plain.best in (4, 8)
+    np.testing.assert_allclose(turned.score, plain.score, rtol=1e-3)

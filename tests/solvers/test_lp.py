@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from halfwidth.errors import BadShape, BadValue
 from halfwidth.solvers import lp
-from halfwidth.solvers.lp import certifies, judge, solve
+from halfwidth.solvers.lp import solve
 from halfwidth.solvers.program import Claim, Program, Solver, Verdict
+from halfwidth.solvers.proof import certifies, judge
 from halfwidth.solvers.stock import HIGHS, PIQP, highs
 
 INF = np.inf
@@ -222,8 +223,8 @@ def test_infeasible_without_a_proof_is_proved_by_the_elastic_program():
 
 def test_reduced_accuracy_is_said(monkeypatch):
     """Between the two tolerances the verdict says so; polishing, which would mend it, is taken away."""
-    monkeypatch.setattr(lp, "_polished", lambda program, x, z, check: (x, z, check))
-    monkeypatch.setattr(lp, "_cleaned", lambda program, z, slope: None)
+    monkeypatch.setattr(lp, "polished", lambda program, x, z, check: (x, z, check))
+    monkeypatch.setattr(lp, "cleaned", lambda program, z, slope: None)
 
     def rough(p):
         claim = HIGHS.run(p)

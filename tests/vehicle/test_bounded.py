@@ -44,6 +44,18 @@ def test_perfect_data_sit_on_the_floors():
     assert np.hypot(path.east - drive.east, path.north - drive.north).max() < 0.3
 
 
+def test_quantisation_of_the_log_raises_the_floors():
+    drive = a_drive()
+    step = float(np.median(drive.h))
+    counts = {"speed_mps": 0.2, "yaw_rate_radps": 0.01, "lat_deg": 1e-6}
+    for steps, along, azimuth, north in (({}, 0.02, 0.001, 0.005), (counts, 0.1, 0.005, 0.5e-6 * 111_200)):
+        coarse = dataclasses.replace(drive, steps=steps)
+        model, *_ = bounded.linearised(coarse, np.zeros(len(drive)), bounded.Bounded())
+        assert model.w.at_least[[bounded.ALONG, bounded.AZIMUTH]] == pytest.approx([along * step, azimuth * step])
+        assert model.e.at_least == pytest.approx([0.005, north], rel=0.01)
+        assert model.w.at_least[bounded.OFFSET_E] == 0.005  # an offset is not rounded
+
+
 def test_two_fixes_are_enough_and_a_drive_without_speed_too():
     drive = a_drive()
     few = dataclasses.replace(drive, seen=np.isin(np.arange(len(drive)), [10, 120]))

@@ -19,7 +19,8 @@ from tests.vehicle.made_tracks import made_track
 
 from halfwidth.errors import BadValue, Missing
 from halfwidth.vehicle import write as module
-from halfwidth.vehicle.write import absolute, ending, endings, stamps
+from halfwidth.vehicle.maps import absolute, stamps
+from halfwidth.vehicle.write import ending, endings
 
 EPOCH = datetime(2024, 5, 1, 8, 0, 0, tzinfo=UTC)
 GPX = "{http://www.topografix.com/GPX/1/1}"

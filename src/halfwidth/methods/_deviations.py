@@ -90,6 +90,7 @@ def _symmetric(P: Array) -> Array:
     return np.asarray(0.5 * P + 0.5 * P.T)
 
 
+@np.errstate(all="ignore")  # what leaves the range of numbers is caught where it would be used
 def scan(
     g: Function,
     h: Function,
@@ -106,25 +107,6 @@ def scan(
     smooth: bool = False,
 ) -> dict[str, Any]:
     """Run the filter, and the smoother if asked; arguments and answer as the core's ``nonlinear_run``."""
-    # What leaves the range of numbers is caught where it would be used.
-    with np.errstate(all="ignore"):
-        return _scan(g, h, Q, R, x0, P0, y, seen, spread, iterations, about, smooth)
-
-
-def _scan(
-    g: Function,
-    h: Function,
-    Q: Callable[[int], Array],
-    R: Callable[[int], Array],
-    x0: Array,
-    P0: Array,
-    y: Array,
-    seen: Any,
-    spread: Spread,
-    iterations: int,
-    about: Array | None,
-    smooth: bool,
-) -> dict[str, Any]:
     T, n = len(y), len(x0)
     sigma = spread.distance > 0.0
     if sigma:

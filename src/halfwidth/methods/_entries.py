@@ -1,7 +1,8 @@
 """The posterior with unknown entries theta of A, B, C, E, F: evidence climbed over theta, then integrated.
 
-Half-widths are found anew for every theta. The prior of theta is flat within ``theta_bounds``. Around the mode the
-evidence is evaluated at weighted nodes, and the answer is the mixture of theirs.
+Half-widths are found anew for every theta. The search begins in the middle of ``theta_bounds``, or where sequential
+linear programming ends if that explains the record better. The prior of theta is flat within the bounds. Around the
+mode the evidence is evaluated at weighted nodes, and the answer is the mixture of theirs.
 """
 
 import math
@@ -12,6 +13,8 @@ import numpy as np
 
 from halfwidth.array import Array
 from halfwidth.methods._linearised import filled
+from halfwidth.methods._noise_parts import bounded_only
+from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
@@ -35,7 +38,7 @@ def with_entries(method: "Posterior", model: Linear, record: Record) -> Estimate
     search = _Search(method, model, record)
     theta, converged = search.climb()
     if search.best is None:
-        return search.failed()
+        return search.failed(typed(method))
     L = search.width(theta)
     p = len(theta)
     z = nodes(p, _NODES)
@@ -74,13 +77,29 @@ class _Search:
 
     def at(self, theta: Array) -> float:
         """Return log evidence at the mode of the half-widths, and keep the best."""
-        answer = self.method.answer(self.model(theta), self.record, start=self.start)
+        model = self.model(theta)
+        answer = self.method.answer(model, self.record, start=self.start)
+        if answer.code >= 2 and self.start is not None:
+            # What was found elsewhere may lead astray here.
+            answer = self.method.answer(model, self.record)
         if not np.isfinite(answer.found["log_mode"]) or answer.code >= 2:
             return -math.inf
         value = float(answer.found["log_mode"])
         if value > self.value:
             self.value, self.best, self.start = value, answer, answer.start
         return value
+
+    def by_programs(self) -> list[Array]:
+        """Return the theta that linear programs fit with bounded noise alone, if any: the middle may be far off."""
+        from halfwidth.methods.sequential import SequentialLP
+
+        model, method = bounded_only(self.asked), SequentialLP()
+        if method.refuses(model) is not None:
+            return []
+        found = method.run(model, self.record)
+        if found.theta is None or not found.status.good or not np.isfinite(found.theta).all():
+            return []
+        return [np.clip(found.theta, self.lo, self.hi)]
 
     def slope(self, theta: Array, size: Array) -> tuple[Array, Array]:
         """Return gradient and diagonal of the Hessian by central differences."""
@@ -100,8 +119,8 @@ class _Search:
         """Climb by a quasi-Newton search within the bounds."""
         from scipy.optimize import minimize
 
-        theta = self.first
-        if math.isinf(self.at(theta)):
+        theta = max([self.first, *self.by_programs()], key=self.at)
+        if math.isinf(self.value):
             # Nothing fits there, as where an unknown output gain is 0: look elsewhere between the bounds.
             width = np.where(np.isfinite(self.hi - self.lo), self.hi - self.lo, 2.0)
             points = np.random.default_rng(20260).uniform(-0.45, 0.45, (_ELSEWHERE, len(theta))) * width + theta
@@ -148,18 +167,16 @@ class _Search:
         root = vector / np.sqrt(np.maximum(value, 0.1))
         return np.asarray(sd[:, None] * root)
 
-    def failed(self) -> Estimate:
+    def failed(self, name: str) -> Estimate:
         """Return what is said where no value of theta that was tried fits."""
         est = self.method.answer(self.model(self.first), self.record).estimate
-        return replace(est, theta=None)
+        return replace(est, theta=None, method=name)
 
 
 def _mixture(
     method: "Posterior", model: Linear, found: list[tuple[float, Array, Estimate]], search: _Search, converged: bool,
     L: Array,
 ) -> Estimate:  # fmt: skip
-    from halfwidth.methods._protocol import typed
-
     top = max(f[0] for f in found)
     weight = np.array([math.exp(f[0] - top) for f in found])
     total = float(weight.sum())

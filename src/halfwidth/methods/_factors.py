@@ -17,17 +17,10 @@ from halfwidth.methods._residuals import _eliminate
 from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.spread import Box
-from halfwidth.varying import Varying
 
 GAUSSIAN, UNIFORM, UNIFORM_GAUSSIAN, CONTAMINATED, MAYBE_LOST, TRUNCATION = range(6)
 #: Variances below this share of the output's own scale, squared, count as no noise: information must stay finite.
 EXACT = 1e-12
-
-
-def every(matrix: Varying, record: Record, dt: Array) -> Array:
-    """Return the matrix of each row, (T, rows, columns)."""
-    stack, index = matrix.stack(record.t, dt)
-    return np.broadcast_to(stack, (len(record), *stack.shape[1:])) if index is None else stack[index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,18 +62,18 @@ def outputs(model: Linear, record: Record, dt: Array, scale: Array, outliers: bo
     box, part = uniform_part(model.e), gaussian_part(model.e)
     if box is None and part is not None and part.known:
         return _gaussian(model, record, dt, scale)
-    C, seen = every(model.C, record, dt), record.seen
+    C, seen = model.C.each(record.t, dt), record.seen
     t, j = np.nonzero(seen)
     Y = np.eye(ny)[j]
     R = np.zeros((T, ny))
     own = None if part is None else given(part, ny)
     if own is not None:
-        R = np.diagonal(every(own, record, dt), axis1=1, axis2=2)
+        R = np.diagonal(own.each(record.t, dt), axis1=1, axis2=2)
     lo, hi = ends_of(part, ny)
     deviation = np.where(lo < hi, once + nx + np.arange(ny), -1)[j]
     mix = np.zeros((len(t), p))
     if model.F is not None:
-        F = every(model.F, record, dt)
+        F = model.F.each(record.t, dt)
         N = _eliminate(F, seen)
         C, Y = N @ C, (N @ F)[t, j]
         R = np.einsum("tij,tj->ti", N**2, R)
@@ -111,10 +104,10 @@ def _gaussian(model: Linear, record: Record, dt: Array, scale: Array) -> list[Fa
     nx, ny = model.nx, model.ny
     part = gaussian_part(model.e)
     assert part is not None
-    C, R = every(model.C, record, dt), every(part.cov(), record, dt)
+    C, R = model.C.each(record.t, dt), part.cov().each(record.t, dt)
     y = np.where(record.seen, record.y, 0.0)
     if model.F is not None:
-        inverse = np.linalg.inv(every(model.F, record, dt))
+        inverse = np.linalg.inv(model.F.each(record.t, dt))
         C = inverse @ C
         R = inverse @ R @ np.swapaxes(inverse, 1, 2)
     found = []
@@ -158,7 +151,7 @@ def _gaussian(model: Linear, record: Record, dt: Array, scale: Array) -> list[Fa
 def _lost(model: Linear, record: Record, dt: Array, t: NDArray[np.intp], j: NDArray[np.intp]) -> Array:
     """Return the log density of each seen output if it was lost."""
     # unknown noise says nothing here: the noise of lost samples is given then
-    R = every(model.e.cov(), record, dt) if model.e.known else np.zeros((len(record), model.ny, model.ny))
+    R = model.e.cov().each(record.t, dt) if model.e.known else np.zeros((len(record), model.ny, model.ny))
     kind = model.loss.kind[0]
     found = np.zeros(len(t))
     center = np.broadcast_to(np.asarray(model.loss.center, dtype=float), (model.ny,))

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from halfwidth.array import Array
+from halfwidth.array import Array, wrapped
 from halfwidth.methods._residuals import half_width_bounds, reference, residuals
 from halfwidth.model import Entry, Linear, Model, Nonlinear, arity
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
-from halfwidth.solvers.banded import Chain, chain_of, solve
+from halfwidth.solvers.banded import solve
+from halfwidth.solvers.chain import Chain, chain_of
 from halfwidth.spread import Box, Normal
 from halfwidth.tape import Tape, Untraceable
 from halfwidth.trace import compiled
@@ -260,20 +261,14 @@ class NonlinearRows(_Worth):
             found += [np.ascontiguousarray(value), np.ascontiguousarray(slope)]
         return found[0], found[1], found[2], found[3]
 
-    def _wrapped(self, difference: Array, angles: tuple[int, ...]) -> Array:
-        if angles:
-            k = list(angles)
-            difference[:, k] = (difference[:, k] + np.pi) % (2 * np.pi) - np.pi
-        return difference
-
     def chain(self, x: Array, theta: Array, c: Array) -> Chain:  # noqa: ARG002
         """Return the linear program about x."""
         g, g_x, h, h_x = self._along(x)
         box, x0 = self.model.bounds, self.model.x0
         lo, hi = x0.interval(0.9999) if isinstance(x0, Normal) else (x0.lo, x0.hi)
         # Residuals as they are at x, wrapped where they are angles, then moved along the tangent.
-        w = self._wrapped(x[1:] - g, self.model.x_angles)
-        e = self._wrapped(h - self.y, self.model.y_angles)
+        w = wrapped(x[1:] - g, self.model.x_angles)
+        e = wrapped(h - self.y, self.model.y_angles)
         tangent = (g_x @ x[:-1, :, None])[..., 0]
         return Chain(
             A=g_x,
@@ -295,8 +290,8 @@ class NonlinearRows(_Worth):
     def residuals(self, x: Array, theta: Array) -> Array:  # noqa: ARG002
         """Return the true residuals (T, groups), NaN where no row is."""
         rho = np.hstack([x[1:] - self._values("g", x[:-1]), self._values("h", x[1:]) - self.y])
-        self._wrapped(rho[:, : self.nx], self.model.x_angles)
-        rho[:, self.nx :] = self._wrapped(rho[:, self.nx :], self.model.y_angles)
+        rho[:, : self.nx] = wrapped(rho[:, : self.nx], self.model.x_angles)
+        rho[:, self.nx :] = wrapped(rho[:, self.nx :], self.model.y_angles)
         rho[:, self.nx :][~self.record.seen] = np.nan
         return rho
 
@@ -336,7 +331,7 @@ class NonlinearRows(_Worth):
             h, h_x = (part[0] for part in self._along(np.vstack([x, x]), 1)[2:])
             if not (np.isfinite(h).all() and np.isfinite(h_x).all()):
                 return np.asarray(box.mean)
-            miss = self._wrapped((y - h)[None], self.model.y_angles)[0]
+            miss = wrapped((y - h)[None], self.model.y_angles)[0]
             step = np.linalg.lstsq(h_x[there], miss[there], rcond=None)[0]
             x = np.clip(x + step, box.lo, box.hi)
         return np.asarray(x if np.isfinite(x).all() else box.mean)

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.derivative import differences
-from halfwidth.loss import Loss, Modes
+from halfwidth.loss import Loss
+from halfwidth.methods._loss_modes import Modes, modes_of
 from halfwidth.model import Linear, Nonlinear, arity
 from halfwidth.record import Record
 
@@ -65,7 +66,7 @@ def outputs_and_modes(rows: Rows, loss: Loss | None, record: Record) -> tuple[Ar
         d = None if rows.d is None else rows.d[:, None]
         carries = np.ones((1, record.ny), dtype=bool)
         return y, Modes(rows.C[:, None], d, rows.R[:, None], one, one[0, 0], None, carries)
-    modes = loss.modes(rows.C, rows.R, record.y, record.seen)
+    modes = modes_of(loss, rows.C, rows.R, record.y, record.seen)
     if rows.d is not None:
         base = 0.0 if modes.d is None else modes.d
         modes = modes._replace(d=np.ascontiguousarray(np.where(modes.carries, rows.d[:, None] + base, base)))

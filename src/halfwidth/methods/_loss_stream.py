@@ -8,7 +8,8 @@ import numpy as np
 import halfwidth._core as _core
 from halfwidth.array import Array
 from halfwidth.errors import BadRecord, HalfwidthError, Refused, hinted
-from halfwidth.loss import Bernoulli, Modes
+from halfwidth.loss import Bernoulli
+from halfwidth.methods._loss_modes import Modes
 from halfwidth.methods._loss_rows import Rows, linear_rows, outputs_and_modes, received, tangent
 from halfwidth.methods._protocol import typed
 from halfwidth.model import Linear, Model

@@ -4,12 +4,15 @@ There are p = nx + ny groups, the half-widths (q, r), or twice as many: then the
 of Gaussian parts of w and e whose variances are unknown.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.array import Array
 from halfwidth.model import Linear, Model
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
+from halfwidth.spread import Box
 from halfwidth.varying import Varying, varying
 
 
@@ -63,6 +66,16 @@ def _half_widths(model: Linear) -> tuple[Array, Array, NDArray[np.bool_]]:
         np.concatenate([f[1] for f in parts]),
         np.concatenate([f[2] for f in parts]),
     )
+
+
+def bounded_only(model: Linear) -> Linear:
+    """Return the model with bounded noise of unknown size instead of Gaussian noise, and a box as prior."""
+    free = [
+        noise if isinstance(noise, Uniform) else Uniform.unknown().sized(n, "noise")
+        for noise, n in ((model.w, model.nx), (model.e, model.ny))
+    ]
+    prior = model.x0 if isinstance(model.x0, Box) else Box(np.full(model.nx, -np.inf), np.full(model.nx, np.inf))
+    return replace(model, w=free[0], e=free[1], x0=prior)
 
 
 def uniform_part(noise: Noise) -> Uniform | None:

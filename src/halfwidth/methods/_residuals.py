@@ -94,20 +94,16 @@ def residuals(model: Linear, record: Record) -> Residuals:
     T, nx, ny = len(record), model.nx, model.ny
     dt = record.steps(model.dt)
 
-    def every(matrix: Varying) -> Array:
-        stack, index = matrix.stack(record.t, dt)
-        return np.broadcast_to(stack, (T, *stack.shape[1:])) if index is None else stack[index]
-
-    A, C = every(model.A), every(model.C)
-    E = np.broadcast_to(np.eye(nx), (T, nx, nx)) if model.E is None else every(model.E)
+    A, C = model.A.each(record.t, dt), model.C.each(record.t, dt)
+    E = np.broadcast_to(np.eye(nx), (T, nx, nx)) if model.E is None else model.E.each(record.t, dt)
     drive = np.zeros((T, nx))
     if model.B is not None and record.u is not None:
-        drive = np.einsum("tij,tj->ti", every(model.B), record.u)
+        drive = np.einsum("tij,tj->ti", model.B.each(record.t, dt), record.u)
     y = np.where(record.seen, record.y, 0.0)
     if model.F is None:
         N, Cy, Fy = None, C, y
     else:
-        F = every(model.F)
+        F = model.F.each(record.t, dt)
         N = _eliminate(F, record.seen)
         Cy, Fy = N @ C, np.einsum("tij,tj->ti", N @ F, y)
 
@@ -312,13 +308,9 @@ def unseen_directions(rows: Residuals, model: Linear, record: Record) -> Array:
     T, nx = rows.T, rows.nx
     dt = record.steps(model.dt)
 
-    def every(matrix: Varying) -> Array:
-        stack, index = matrix.stack(record.t, dt)
-        return np.broadcast_to(stack, (T, *stack.shape[1:])) if index is None else stack[index]
-
-    Phi = np.array(every(model.A))
+    Phi = np.array(model.A.each(record.t, dt))
     if model.E is not None:
-        Phi = np.array(np.linalg.solve(every(model.E), Phi), dtype=np.float64)
+        Phi = np.array(np.linalg.solve(model.E.each(record.t, dt), Phi), dtype=np.float64)
     # Rows of seen outputs with their unseen partners eliminated, straight from the residual matrix.
     C = np.zeros((T, rows.ny, nx))
     outputs = rows.M[T * nx :].tocoo()

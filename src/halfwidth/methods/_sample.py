@@ -24,6 +24,7 @@ from halfwidth.array import Array, generator
 from halfwidth.errors import BadValue
 from halfwidth.methods._convergence import convergence
 from halfwidth.methods._linearised import filled
+from halfwidth.methods._noise_parts import bounded_only
 from halfwidth.methods._protocol import typed
 from halfwidth.methods._residuals import reference, residuals
 from halfwidth.methods._sample_rows import Rows, laid_out
@@ -33,7 +34,7 @@ from halfwidth.model import Linear, Model, needs_a_box
 from halfwidth.noise import Gaussian, Noise, Uniform, unknown_variances
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.spread import Box, Cloud
+from halfwidth.spread import Cloud
 
 #: Chains that agree this well are good, and good enough to be used.
 _FINE, _USABLE = 1.01, 1.05
@@ -274,25 +275,15 @@ def _ends(model: Linear) -> tuple[Array, Array, NDArray[np.int64]]:
     return np.r_[w[0], e[0]], np.r_[w[1], e[1]], np.r_[w[2], e[2]].astype(np.int64)
 
 
-def _bounded(model: Linear) -> Linear:
-    """Return the model with bounded noise of unknown size instead of Gaussian noise, and a box as prior."""
-    free = [
-        noise if isinstance(noise, Uniform) else Uniform.unknown().sized(n, "noise")
-        for noise, n in ((model.w, model.nx), (model.e, model.ny))
-    ]
-    prior = model.x0 if isinstance(model.x0, Box) else Box(np.full(model.nx, -np.inf), np.full(model.nx, np.inf))
-    return replace(model, w=free[0], e=free[1], x0=prior)
-
-
 def _bounded_point(model: Linear, record: Record) -> Estimate:
     """Return the trajectory of least excess over the bounds."""
-    return (SequentialLP() if model.theta_entries else BatchLP()).run(_bounded(model), record)
+    return (SequentialLP() if model.theta_entries else BatchLP()).run(bounded_only(model), record)
 
 
 def _start(model: Linear, record: Record, rows: Rows) -> tuple[Array, Array, Array] | None:
     """Return a trajectory inside all bounds (N,), theta, and the standard deviation of each row (K,); or None."""
     floor, cap, kind = _ends(model)
-    bounded = _bounded(model)
+    bounded = bounded_only(model)
     if model.theta_entries:  # the warm-up finds its way into caps that no linearisation knows
         loose = [Uniform.unknown().sized(n, "noise") for n in (model.nx, model.ny)]
         found = SequentialLP().run(replace(bounded, w=loose[0], e=loose[1]), record)

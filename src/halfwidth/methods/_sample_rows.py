@@ -61,8 +61,7 @@ def laid_out(model: Linear, record: Record) -> Rows:
     fixed = filled(model, np.full(len(entries), _PLACE)) if entries else model
     F = np.broadcast_to(np.eye(ny), (T, ny, ny))
     if fixed.F is not None:
-        stack, index = fixed.F.stack(record.t, dt)
-        F = np.broadcast_to(stack, (T, ny, ny)) if index is None else stack[index]
+        F = fixed.F.each(record.t, dt)
     needed = _needed(F, record.seen, fixed.e, record)
     y = np.where(record.seen, record.y, np.where(needed, 0.0, np.nan))
     whole = replace(record, y=y)
@@ -179,8 +178,7 @@ def _whiten(rows: Rows, noise: Gaussian, name: str, record: Record, dt: Array, n
     import scipy.sparse as sp
 
     T, seen = rows.base.T, record.seen
-    stack, index = noise.cov().stack(record.t, dt)
-    Q = np.broadcast_to(stack, (T, *stack.shape[1:])) if index is None else stack[index]
+    Q = noise.cov().each(record.t, dt)
     blocks = []
     for t in range(T):
         part = Q[t] if name == "w" else Q[t][np.ix_(seen[t], seen[t])]

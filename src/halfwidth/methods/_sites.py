@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import halfwidth._core as _core
 from halfwidth.array import Array
-from halfwidth.methods._factors import EXACT, GAUSSIAN, MAYBE_LOST, TRUNCATION, bounds, every, first_bounds, outputs
+from halfwidth.methods._factors import EXACT, GAUSSIAN, MAYBE_LOST, TRUNCATION, bounds, first_bounds, outputs
 from halfwidth.methods._noise_parts import all_groups, ends_of, gaussian_part, given, uniform_part
 from halfwidth.methods._residuals import felt, reference, residuals
 from halfwidth.model import Linear
@@ -383,10 +383,10 @@ def _dynamics(problem: dict[str, Any], model: Linear, record: Record, dt: Array)
             if Q is not None:
                 problem["Q"] = G @ problem["Q"] @ G[0].T
         else:
-            G = np.linalg.inv(every(model.E, record, dt))
-            A, A_index = G @ every(model.A, record, dt), None
+            G = np.linalg.inv(model.E.each(record.t, dt))
+            A, A_index = G @ model.A.each(record.t, dt), None
             if Q is not None:
-                problem["Q"], problem["Q_index"] = G @ every(Q, record, dt) @ np.swapaxes(G, 1, 2), None
+                problem["Q"], problem["Q_index"] = G @ Q.each(record.t, dt) @ np.swapaxes(G, 1, 2), None
         problem["G"] = np.ascontiguousarray(G, dtype=float)
     if problem["Q"] is not None:
         problem["Q"] = np.ascontiguousarray(problem["Q"], dtype=float)
@@ -398,9 +398,9 @@ def _added(model: Linear, record: Record) -> Array:
     b: Array = np.zeros((len(record), model.nx))
     dt = record.steps(model.dt)
     if model.B is not None and record.u is not None:
-        b = np.einsum("tij,tj->ti", every(model.B, record, dt), record.u)
+        b = np.einsum("tij,tj->ti", model.B.each(record.t, dt), record.u)
     if model.E is not None:
-        b = np.asarray(np.linalg.solve(every(model.E, record, dt), b[:, :, None])[:, :, 0])
+        b = np.asarray(np.linalg.solve(model.E.each(record.t, dt), b[:, :, None])[:, :, 0])
     return np.ascontiguousarray(b)
 
 

@@ -40,7 +40,8 @@ from halfwidth.methods.sequential import SequentialLP
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.solvers.banded import Start, chain_of, solve
+from halfwidth.solvers.banded import Start, solve
+from halfwidth.solvers.chain import chain_of
 from halfwidth.spread import Both, Box, Cloud, Normal, Shaped, Spread
 from halfwidth.spread import part as rows_of_spread
 
@@ -210,7 +211,8 @@ class Sliding:
         held, method = self.carried, self.window.method
         assert held is not None
         assert isinstance(method, Posterior)
-        answer = method.resumed(model, part, held, self.held.first + a, a, max(len(part) - self.window.lag, 0))
+        shaped = max(len(part) - self.window.lag, 0)
+        answer = method.resumed(model, part, held, self.held.first + a, a, shaped, self.held.x[a:])
         newest = self.held.first + len(self.held) - 1
         rows = max(int(np.count_nonzero(part.seen.any(axis=1))), self.window.memory + 1)
         held.take(answer, newest, rows, counts=self.since == 0)

@@ -16,8 +16,9 @@ from halfwidth.methods._residuals import (
 from halfwidth.model import Linear
 from halfwidth.record import Record
 from halfwidth.result import Status
-from halfwidth.solvers.banded import Answer, Chain, Shifted, chain_of
+from halfwidth.solvers.banded import Answer, Shifted
 from halfwidth.solvers.banded import solve as structured
+from halfwidth.solvers.chain import Chain, chain_of
 from halfwidth.solvers.lp import Solution
 from halfwidth.solvers.program import Program
 from halfwidth.spread import Box

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from halfwidth.array import Array, generator
-from halfwidth.errors import BadValue
+from halfwidth.array import Array, generator, wrapped
+from halfwidth.errors import BadValue, Refused, hinted
 from halfwidth.methods._linearised import filled
 from halfwidth.methods._noise_parts import gaussian_part, uniform_part
 from halfwidth.methods._protocol import Estimator
-from halfwidth.model import Linear
+from halfwidth.methods._relinearise import outputs_along
+from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 
@@ -59,7 +60,7 @@ class Comparison:
 
 
 def compare(
-    models: Mapping[str, Linear],
+    models: Mapping[str, Model],
     record: Record,
     method: Estimator | None = None,
     *,
@@ -71,8 +72,8 @@ def compare(
 
     Parameters
     ----------
-    models : mapping of name to Linear
-        Without unknown entries of C and F, with the same outputs.
+    models : mapping of name to Linear or Nonlinear
+        With the same outputs.
     record : Record
     method : estimator, optional
         ``Posterior()`` if absent.
@@ -85,6 +86,8 @@ def compare(
     ------
     BadValue
         If there is no model, one is none, or a setting is out of its domain.
+    Refused
+        If the method cannot work on one of the models.
 
     Examples
     --------
@@ -102,13 +105,18 @@ def compare(
     if not isinstance(models, Mapping):
         raise BadValue(f"`models` is a {type(models).__name__}, models by name were expected", hint='{"still": model}')
     for name, model in models.items():
-        if not isinstance(model, Linear):
-            raise BadValue(f"`models` has {model!r} under {name!r}, a Linear was expected")
+        if not isinstance(model, Linear | Nonlinear):
+            raise BadValue(f"`models` has {model!r} under {name!r}, a Linear or Nonlinear was expected")
     if not 0 < left_out < 1 or folds < 1:
         raise BadValue(f"`left_out` is {left_out!r} and `folds` {folds!r}: a share below 1 and a positive number")
     from halfwidth.methods.posterior import Posterior
 
     method = Posterior() if method is None else method
+    for name, model in models.items():
+        reason = method.refuses(model)
+        if reason is not None:
+            message, hint = hinted(reason)
+            raise Refused(f"the model {name!r}: {message}", hint=hint)
     rng = generator(seed)
     hidden = [record.seen & (rng.random(record.y.shape) < left_out) for _ in range(folds)]
     unit = np.nanstd(record.y, axis=0)
@@ -125,7 +133,7 @@ def compare(
             if not est.status.good or est.P is None or not mask.any():
                 continue
             mean, S = foretold(model, est, part)
-            d = (record.y - mean)[mask]
+            d = wrapped(record.y - mean, getattr(model, "y_angles", ()))[mask]
             v = np.diagonal(S, axis1=1, axis2=2)[mask]
             log_p.append(-0.5 * (np.log(2 * np.pi * v) + d**2 / v))
             off.append(np.abs(d) / np.broadcast_to(unit, mask.shape)[mask])
@@ -140,16 +148,20 @@ def _top(values: Array) -> int:
     return int(np.argmax(np.where(np.isnan(values), -np.inf, values)))
 
 
-def foretold(model: Linear, est: Estimate, record: Record) -> tuple[Array, Array]:
+def foretold(model: Model, est: Estimate, record: Record) -> tuple[Array, Array]:
     """Return mean (T, ny) and covariance (T, ny, ny) of every output, seen or not.
 
-    The half-widths of the output noise count as variances r^2 / 3, unknown ones and unknown entries as estimated.
+    The half-widths of the output noise count as variances r^2 / 3, unknown ones and unknown entries as estimated. A
+    nonlinear `h` is that of the mean state, with its slope there.
     """
-    if model.theta_entries and est.theta is not None:
-        model = filled(model, est.theta)
     dt = record.steps(model.dt)
-    stack, index = model.C.stack(record.t, dt)
-    C = np.broadcast_to(stack, (len(record), *stack.shape[1:])) if index is None else stack[index]
+    if isinstance(model, Nonlinear):
+        mean, C = outputs_along(model, est.x)
+    else:
+        if model.theta_entries and est.theta is not None:
+            model = filled(model, est.theta)
+        C = model.C.each(record.t, dt)
+        mean = np.einsum("tij,tj->ti", C, est.x)
     R = np.zeros((len(record), model.ny, model.ny))
     box, part = uniform_part(model.e), gaussian_part(model.e)
     if box is not None:
@@ -157,13 +169,10 @@ def foretold(model: Linear, est: Estimate, record: Record) -> tuple[Array, Array
     if part is not None and not part.known:
         R = R + np.diag(np.asarray(est.R))
     elif part is not None:
-        own, which = part.cov().stack(record.t, dt)
-        R = R + (own if which is None else own[which])
-    mean = np.einsum("tij,tj->ti", C, est.x)
+        R = R + part.cov().each(record.t, dt)
     var = C @ np.asarray(est.P) @ np.swapaxes(C, 1, 2) + R
-    if model.F is not None:
-        own, which = model.F.stack(record.t, dt)
-        back = np.linalg.inv(own if which is None else own[which])
-        mean = np.einsum("tij,tj->ti", np.broadcast_to(back, var.shape), mean)
+    if isinstance(model, Linear) and model.F is not None:
+        back = np.linalg.inv(model.F.each(record.t, dt))
+        mean = np.einsum("tij,tj->ti", back, mean)
         var = back @ var @ np.swapaxes(back, -1, -2)
     return mean, var

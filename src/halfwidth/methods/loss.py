@@ -364,6 +364,11 @@ class RBPF(LossMethod):
     threshold : float
     prior
         As for `BKF1`.
+
+    Raises
+    ------
+    BadValue
+        If a setting is out of its domain.
     """
 
     particles: int = 100

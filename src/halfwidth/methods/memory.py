@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 import halfwidth._core as _core
-from halfwidth.array import Array
+from halfwidth.array import Array, wrapped
 from halfwidth.errors import BadValue, Refused, hinted
 from halfwidth.methods._answer import Answer
 from halfwidth.methods._linearised import expected, filled
@@ -32,7 +32,7 @@ from halfwidth.methods._sliding import Sliding, Solved
 from halfwidth.methods.map import BatchLP
 from halfwidth.methods.posterior import Posterior
 from halfwidth.methods.window import Window
-from halfwidth.model import Linear, Model
+from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.record import Record
 from halfwidth.show import pyplot
 
@@ -103,7 +103,7 @@ class MemoryChoice:
 
 
 def choose_memory(
-    model: Linear,
+    model: Model,
     record: Record,
     method: Estimator | None = None,
     *,
@@ -118,8 +118,9 @@ def choose_memory(
 
     Parameters
     ----------
-    model : Linear
-        Without unknown entries, or with a method that estimates them.
+    model : Linear or Nonlinear
+        Without unknown entries, or with a method that estimates them. There, and with a nonlinear model, memories are
+        judged by their errors alone.
     record : Record
     method : estimator, optional
         ``BatchLP()`` if absent.
@@ -144,11 +145,12 @@ def choose_memory(
     first = min(max(memories), len(record) // 2)
     if not record.seen[max(first, 1) :].any():
         raise BadValue(f"`record` has no output to foretell after its first {first} rows", hint="a longer record")
-    told = isinstance(method, Posterior) and method.method == "ep" and not model.theta_entries
+    plain = isinstance(model, Linear) and not model.theta_entries
+    told = plain and isinstance(method, Posterior) and method.method == "ep"
     errors, densities = [], []
     for memory in memories:
         window = Window(method, memory, recall=recall)
-        if told:
+        if told and isinstance(model, Linear):
             x, density = _foretold(window, model, record)
             densities.append(density[first:])
             errors.append(np.abs([output_errors(model, record, k, x[k]) for k in range(first, len(record))]))
@@ -276,8 +278,10 @@ def _foretold(window: Window, model: Linear, record: Record) -> tuple[Array, Arr
     return x, density
 
 
-def output_errors(model: Linear, record: Record, k: int, x: Array) -> Array:
+def output_errors(model: Model, record: Record, k: int, x: Array) -> Array:
     """Return y of row k minus what the state x (nx,) makes of it, (ny,); NaN where unseen."""
+    if isinstance(model, Nonlinear):
+        return wrapped(np.where(record.seen[k], record.y[k] - model.output(x), np.nan), model.y_angles)
     t, step = float(record.t[k]), float(record.steps(model.dt)[k])
     y: Array = model.C.at(t, step, k) @ x
     if model.F is not None:
@@ -285,13 +289,15 @@ def output_errors(model: Linear, record: Record, k: int, x: Array) -> Array:
     return np.asarray(np.where(record.seen[k], record.y[k] - y, np.nan))
 
 
-def prediction_errors(model: Linear, record: Record, x: Array, thetas: Array | None = None) -> Array:
+def prediction_errors(model: Model, record: Record, x: Array, thetas: Array | None = None) -> Array:
     """Return y minus its one-step prediction from the newest state x (T, nx) one row before, (T, ny); NaN where unseen.
 
     `thetas` holds the unknown entries that each row's window found, (T, n_theta).
     """
     errors = np.full((len(record), model.ny), np.nan)
     for k in range(1, len(record)):
-        known = model if thetas is None or not np.size(thetas) else filled(model, thetas[k - 1])
+        known = model
+        if isinstance(model, Linear) and thetas is not None and np.size(thetas):
+            known = filled(model, thetas[k - 1])
         errors[k] = output_errors(known, record, k, expected(known, record, k, x[k - 1][None])[0])
     return errors

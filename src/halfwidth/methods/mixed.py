@@ -84,6 +84,11 @@ class MixedFilter:
         Row t uses the outputs up to row t + lag; needs ``form="zonotope"``, since an ellipsoid of a whole stretch of
         states would grow with every row.
 
+    Raises
+    ------
+    BadValue
+        If a setting is out of its domain.
+
     Examples
     --------
     >>> import halfwidth as hw

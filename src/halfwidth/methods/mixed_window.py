@@ -44,6 +44,11 @@ class MixedWindow:
     kappa : float
         Standard deviations that count as much as a half-width.
 
+    Raises
+    ------
+    BadValue
+        If a setting is out of its domain.
+
     Examples
     --------
     >>> import halfwidth as hw

@@ -53,6 +53,11 @@ class ExtendedKalman:
     compiled : bool
         Run compiled where `g` and `h` allow it; False keeps to Python.
 
+    Raises
+    ------
+    BadValue
+        If a setting is out of its domain.
+
     Examples
     --------
     >>> import halfwidth as hw
@@ -115,6 +120,11 @@ class UnscentedKalman:
         2 is best for Gaussian states.
     compiled : bool
         Run compiled where `g` and `h` allow it; False keeps to Python.
+
+    Raises
+    ------
+    BadValue
+        If a setting is out of its domain.
     """
 
     smooth: bool = False

@@ -55,6 +55,11 @@ class ParticleFilter:
     compiled : bool
         Move particles by compiled functions where `g` and `h` allow it.
 
+    Raises
+    ------
+    BadValue
+        If a setting is out of its domain.
+
     Examples
     --------
     >>> import halfwidth as hw

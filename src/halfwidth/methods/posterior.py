@@ -231,17 +231,22 @@ class Posterior:
             return with_entries(self, model, record)
         return self.answer(model, record).estimate
 
-    def resumed(self, model: Model, record: Record, held: Carried, first: int, drop: int, shaped: int = 0) -> "Answer":
+    def resumed(
+        self, model: Model, record: Record, held: Carried, first: int, drop: int, shaped: int = 0,
+        path: Array | None = None,
+    ) -> "Answer":  # fmt: skip
         """Return the answer of one window of a stream.
 
         `held` is what earlier windows handed on, `first` the number of the window's first row, which lies `drop` rows
-        after that of the window before; skewness and kurtosis are asked for from stage `shaped` on.
+        after that of the window before; skewness and kurtosis are asked for from stage `shaped` on. `path` are the
+        newest states of the window's rows, about which a nonlinear model may be linearised.
         """
         known = held.known(first, len(record))
         if isinstance(model, Nonlinear):
             from halfwidth.methods._relinearise import relinearised
 
-            return relinearised(self, model, record, s=None if held.start is None else held.start.s, known=known)
+            s = None if held.start is None else held.start.s
+            return relinearised(self, model, record, s=s, known=known, path=path)
         return self.answer(model, record, start=held.start, drop=drop, known=known, frames=held.frames, shaped=shaped)
 
     def answer(

@@ -47,7 +47,8 @@ from halfwidth.methods.map import BatchLP
 from halfwidth.model import Linear, Model
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.solvers.banded import POINTS, STATUSES, Chain, chain_of, solve
+from halfwidth.solvers.banded import POINTS, STATUSES, solve
+from halfwidth.solvers.chain import Chain, chain_of
 from halfwidth.spread import Box, Spread, part
 
 

@@ -76,6 +76,13 @@ def canvas(folder: str | pathlib.Path) -> tuple[Any, pathlib.Path]:
     return plt, folder
 
 
+def saved(figure: Any, path: pathlib.Path) -> pathlib.Path:
+    """Write a figure and let it go; returns where it is."""
+    figure.savefig(path, dpi=120, bbox_inches="tight")
+    pyplot().close(figure)
+    return path
+
+
 def _cell(value: Any) -> str:
     if value is None:
         return "-"

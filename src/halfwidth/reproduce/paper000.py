@@ -22,7 +22,7 @@ from halfwidth.methods.map import BatchLP
 from halfwidth.model import Linear
 from halfwidth.noise import Noise, Uniform
 from halfwidth.record import Record
-from halfwidth.reproduce import Table, canvas
+from halfwidth.reproduce import Table, canvas, saved
 from halfwidth.reproduce.drives import TOLERANCE, log_table, tolerance_row
 from halfwidth.simulate import simulate
 from halfwidth.spread import Box, Normal
@@ -134,7 +134,5 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
         ax.axhline(TOLERANCE, color="grey", linestyle="--")
         ax.set(xlabel=table.header[0], ylabel="m", title=table.title.split(",")[0])
         ax.legend(fontsize=7)
-        files.append(folder / f"paper000_figure{number}.png")
-        figure.savefig(files[-1], dpi=120, bbox_inches="tight")
-        plt.close(figure)
+        files.append(saved(figure, folder / f"paper000_figure{number}.png"))
     return files

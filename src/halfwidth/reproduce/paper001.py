@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 import halfwidth as hw
 from halfwidth.array import Array
-from halfwidth.reproduce import Table, canvas
+from halfwidth.reproduce import Table, canvas, saved
 
 BURSTS = (0.95, 0.85)
 
@@ -361,8 +361,7 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
                 axis.loglog(s.microseconds, max(s.distance, 1e-5), "o")
                 axis.annotate(method, (s.microseconds, max(s.distance, 1e-5)), fontsize=6)
         axis.set(title=name, xlabel="microseconds a row", ylabel="distance of the mean to depth 10")
-    figure.savefig(files[0], dpi=120)
-    plt.close(figure)
+    saved(figure, files[0])
     case = scenarios()["S4"]
     run = simulate(case, 60, 3)
     smooth = hw.GPB(5, smooth=True, prior="predicted").run(case.model, run.record)
@@ -379,8 +378,7 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
     right.step(run.record.t, smooth.gamma, where="mid", label="P(received)")
     right.legend(fontsize=7)
     right.set(xlabel="s")
-    figure.savefig(files[1], dpi=120)
-    plt.close(figure)
+    saved(figure, files[1])
     return files
 
 

@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 
 from halfwidth.array import Array
-from halfwidth.reproduce import Table, canvas
+from halfwidth.reproduce import Table, canvas, saved
 from halfwidth.reproduce.drives import TOLERANCE, log_table, tolerance_row
 from halfwidth.vehicle import simulate_drive
 from halfwidth.vehicle.align import calibrated
@@ -137,9 +137,7 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
     axes[1, 0].set(xlabel="s into the outage")
     axes[1, 1].set(xlabel="s into the outage")
     axes[0, 0].legend(fontsize=7)
-    files.append(folder / "paper002_course.png")
-    figure.savefig(files[-1], dpi=120, bbox_inches="tight")
-    plt.close(figure)
+    files.append(saved(figure, folder / "paper002_course.png"))
     table = against_length(quick=quick)
     figure, ax = plt.subplots(figsize=(5, 3))
     for k, name in enumerate(ESTIMATORS, start=1):
@@ -149,7 +147,5 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
     ax.axhline(TOLERANCE, color="grey", linestyle="--")
     ax.set(xlabel="outage, s", ylabel="mean of largest distances, m")
     ax.legend(fontsize=7)
-    files.append(folder / "paper002_length.png")
-    figure.savefig(files[-1], dpi=120, bbox_inches="tight")
-    plt.close(figure)
+    files.append(saved(figure, folder / "paper002_length.png"))
     return files

@@ -26,7 +26,7 @@ from halfwidth.methods.window import Window, ensemble_interval
 from halfwidth.model import Linear
 from halfwidth.noise import Gaussian, Uniform
 from halfwidth.record import Record
-from halfwidth.reproduce import Table, canvas
+from halfwidth.reproduce import Table, canvas, saved
 from halfwidth.result import Estimate
 from halfwidth.spread import Box, Normal
 
@@ -349,9 +349,7 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
     ax.axhline(F[0, 1], color="black", linewidth=0.8, label="true")
     ax.set(xlabel="row", ylabel="F12", title="Figure 1: estimate of F12")
     ax.legend()
-    files.append(folder / "paper003_figure1.png")
-    figure.savefig(files[-1], dpi=120, bbox_inches="tight")
-    plt.close(figure)
+    files.append(saved(figure, folder / "paper003_figure1.png"))
 
     figure, ax = plt.subplots(figsize=(8, 3))
     span = slice(100, 160)
@@ -362,9 +360,7 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
             ax.plot(range(100, 160), side[span, 2], style, color="C1", label=f"kappa {kappa}" if k == 0 else None)
     ax.set(xlabel="row", ylabel="x3", title="Figure 2: interval of the third state, memory 25")
     ax.legend()
-    files.append(folder / "paper003_figure2.png")
-    figure.savefig(files[-1], dpi=120, bbox_inches="tight")
-    plt.close(figure)
+    files.append(saved(figure, folder / "paper003_figure2.png"))
 
     figure, ax = plt.subplots(figsize=(5, 3))
     rng = np.random.default_rng(0)
@@ -383,9 +379,7 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
         ax.semilogy(sizes, took, marker="o", label=f"memory {memory}")
     ax.set(xlabel="states", ylabel="ms a row", title="Figure 3: time of a row")
     ax.legend()
-    files.append(folder / "paper003_figure3.png")
-    figure.savefig(files[-1], dpi=120, bbox_inches="tight")
-    plt.close(figure)
+    files.append(saved(figure, folder / "paper003_figure3.png"))
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3))
     memories = (5, 10, 25) if quick else (5, 10, 15, 25, 50)
@@ -402,7 +396,5 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
     )
     left.legend()
     right.legend(fontsize=7)
-    files.append(folder / "paper003_table1.png")
-    figure.savefig(files[-1], dpi=120, bbox_inches="tight")
-    plt.close(figure)
+    files.append(saved(figure, folder / "paper003_table1.png"))
     return files

@@ -18,7 +18,7 @@ import numpy as np
 from halfwidth import fusion
 from halfwidth.array import Array
 from halfwidth.fusion import Fused, Source, fuse
-from halfwidth.reproduce import Table, canvas
+from halfwidth.reproduce import Table, canvas, saved
 
 Z = 12.0
 N = 1000
@@ -209,9 +209,7 @@ def figures(folder: str | pathlib.Path, *, quick: bool = False) -> list[pathlib.
         axes[1].set(ylabel="sqrt E", ylim=(0, 1.2))
         axes[2].plot(k, np.sqrt(found.S[:, 0]))
         axes[2].set(ylabel="sigma", xlabel="k", ylim=(0, 1.5))
-        files.append(folder / f"paper004_figure{number}.png")
-        figure.savefig(files[-1], dpi=120)
-        plt.close(figure)
+        files.append(saved(figure, folder / f"paper004_figure{number}.png"))
     return files
 
 

@@ -361,7 +361,7 @@ def problem(drive: Grid, settings: TwoAntennas) -> tuple[Nonlinear, Record, Floa
     return model, Record(drive.t, np.column_stack([y[name] for name in model.names.y])), x, notes
 
 
-def _half_steps(drive: Grid) -> dict[str, float]:
+def half_steps(drive: Grid) -> dict[str, float]:
     """Return half the quantisation step of each output that has one, in the output's unit."""
     found = {name: 0.5 * drive.steps.get(stream, 0.0) for name, stream in _STREAM.items()}
     frame = drive.frame
@@ -385,7 +385,7 @@ def _model(drive: Grid, settings: TwoAntennas, baseline: Floats | None) -> Nonli
     if driven:
         # the speed follows the acceleration, whose limits would mean little if it could jump besides
         q_lo[states.index("speed")], q_hi[states.index("speed")] = 1e-3, 0.02
-    steps = _half_steps(drive)
+    steps = half_steps(drive)
     r_lo = np.array([max(OUTPUT_FLOORS[name.rstrip("12")], steps.get(name.rstrip("12"), 0.0)) for name in outputs])
     r_hi = np.full(len(outputs), np.inf)
     lo, hi = np.full(len(states), -np.inf), np.full(len(states), np.inf)

@@ -17,8 +17,9 @@ Each round solves a linear program (`halfwidth.BatchLP`, through the core's inte
 round before. One wrong fix sets the half-width of all fixes: with `nu` every row may exceed its half-width at a price,
 and each group minimises the mean of its worst fraction nu (`halfwidth.BatchLP`), which `nu_of` chooses by hiding
 stretches of the same log. Fixes that are then far beyond what the others keep within are named, and left out of the
-rounds that follow. Half-widths have physical floors: without them the logarithmic objective has no minimum, and a
-half-width that sits on its floor is named in ``path.info``. Minimal half-widths guarantee nothing: the path has no
+rounds that follow. Half-widths have physical floors, half a quantisation step of the log or what sensors of the kind
+have: without them the logarithmic objective has no minimum, and a half-width that sits on its floor is named in
+``path.info``. Minimal half-widths guarantee nothing: the path has no
 variance of its own, and `fill` gives it the size that hiding fixes shows.
 """
 
@@ -36,6 +37,7 @@ from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
 from halfwidth.spread import Box
+from halfwidth.vehicle.antennas import half_steps
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pointing import azimuth_of, with_speed
@@ -72,7 +74,8 @@ class Bounded:
     rounds : int
         Linear programs, each about the azimuth of the one before.
     speed_floor, side_floor : float
-        Least half-width of the speed along and across the way, m/s: a count of a wheel sensor.
+        Least half-width of the speed along and across the way, m/s: a count of a wheel sensor, unless the log's own
+        speed has steps that are more than twice as large. So with the others.
     yaw_floor : float
         Least half-width of the yaw rate, rad/s: a count of a gyro.
     fix_floor : float
@@ -305,10 +308,13 @@ def linearised(drive: Grid, psi: Floats, settings: Bounded) -> tuple[Linear, Flo
     step = float(np.median(h))
     known = [_SCALE_WALK * step, _BIAS_WALK * step]
     offset = n - 5
-    low = [settings.speed_floor * step, settings.side_floor * step, settings.yaw_floor * step, *known]
+    counts = half_steps(drive)
+    speed, yaw = max(settings.speed_floor, counts["speed"]), max(settings.yaw_floor, counts["yaw_rate"])
+    low = [speed * step, settings.side_floor * step, yaw * step, *known]
     high = [20.0 * step, 5.0 * step, 1.0 * step, *known]
     noise = Uniform.unknown(at_least=[*low, *[settings.fix_floor] * offset], at_most=[*high, *[30.0] * offset])
-    fix = Uniform.unknown(at_least=[settings.fix_floor] * 2, at_most=[200.0] * 2)
+    fixes = [max(settings.fix_floor, counts[axis]) for axis in ("east", "north")]
+    fix = Uniform.unknown(at_least=fixes, at_most=[200.0] * 2)
     # where the offset begins cannot be told from where the car does: it begins at 0
     far = 1e3 + float(np.sum(np.abs(vh)))
     x0 = Box(

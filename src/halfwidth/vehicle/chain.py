@@ -30,19 +30,21 @@ posterior squared residuals (expectation maximisation, Shumway and Stoffer 1982)
 own path first. Many drives (outages of one log) are solved side by side.
 
 Where a yaw rate is silent for a while its residual has no noise of its own: the yaw rate is what the log's own are
-like, and how it deviates from what is expected between the samples on both sides is one more state (`turning`).
+like, and how it deviates from what is expected between the samples on both sides is one more state (`turning`). A gap
+without a yaw rate is solved from two sides, since a car may have gone round either way (`bends`).
 Without a speed sensor the speed is that of the fixes, with a large variance between them; without a gyro the yaw rate
 is taken as 0 and the scale of the yaw residual learns how much the car turns.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth import _core
 from halfwidth.result import Status
+from halfwidth.vehicle.bends import Trial, started
 from halfwidth.vehicle.chain_rows import Rows, rows_of
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
@@ -65,6 +67,9 @@ LONGITUDINAL, LATERAL, SLIP, YAW, OFFSET, DRIFT, FIX = range(7)
 
 #: Rows of all drives that are solved side by side at most, but for a single longer drive.
 _BATCH = 20_000
+
+#: Rounds in which a gap without a yaw rate is tried from another side.
+_TRIAL = 6
 
 E, N, AZIMUTH, OFFSET_E, OFFSET_N, SCALE, BIAS, DRIFT_E, DRIFT_N, TURN = range(10)
 
@@ -153,7 +158,8 @@ def solve(
     sigma : (7,) or (n, 7) array, optional
         Scales to start from, or to keep.
     azimuth : sequence of (T,) arrays, optional
-        Azimuths to linearise about first; `azimuth_of` each drive if absent.
+        Azimuths to linearise about first; if absent `azimuth_of` each drive, in gaps without a yaw rate what fits
+        (`started`).
     weight : sequence of (T,) arrays, optional
         Weights of the increments of the offset to start from; 1 if absent.
     learn : bool
@@ -164,20 +170,58 @@ def solve(
     list of Fit
         With ``path.status`` STALLED where the numbers broke down; such a path is not to be used.
     """
-    start = np.broadcast_to(_START if sigma is None else sigma, (len(drives), len(GROUPS)))
-    azimuths = [None] * len(drives) if azimuth is None else list(azimuth)
-    weights = [None] * len(drives) if weight is None else list(weight)
+    given = [with_speed(drive) for drive in drives]
+    scales = np.broadcast_to(_START if sigma is None else sigma, (len(given), len(GROUPS)))
+    shares = [np.ones(len(drive)) for drive in given] if weight is None else list(weight)
+    if azimuth is not None:
+        return _batched(given, settings, scales, azimuth, shares, learn)
+    first = [azimuth_of(drive) for drive in given]
+    if not learn:
+        return _batched(given, settings, scales, started(given, first, _trial(settings, scales)), shares, learn)
+    fits = _batched(given, settings, scales, first, shares, learn)
+    # now that it is known how large the noise is, gaps without a yaw rate are tried from another side
+    found = [fit.z[:, AZIMUTH] for fit in fits]
+    other = started(given, found, _trial(settings, np.array([fit.sigma for fit in fits]).reshape(scales.shape)))
+    which = [i for i in range(len(given)) if other[i] is not found[i]]
+    again = _batched(
+        [given[i] for i in which], settings, scales[which], [other[i] for i in which], [shares[i] for i in which], learn
+    )
+    for i, fit in zip(which, again, strict=True):
+        if fit.path.status is Status.OK and not fit.loglik < fits[i].loglik:
+            fits[i] = fit
+    return fits
+
+
+def _trial(settings: Chain, sigma: Floats) -> Trial:
+    """Return what solves parts of drives with scales (n, 7) that are known."""
+    quick = replace(settings, rounds=_TRIAL)
+
+    def solved(which: Sequence[int], parts: Sequence[Grid], azimuth: Sequence[Floats]) -> list[tuple[float, Floats]]:
+        fits = _batched(parts, quick, sigma[list(which)], azimuth, [np.ones(len(part)) for part in parts], False)
+        return [(fit.loglik if fit.path.status is Status.OK else -np.inf, fit.z[:, AZIMUTH]) for fit in fits]
+
+    return solved
+
+
+def _batched(
+    drives: Sequence[Grid],
+    settings: Chain,
+    sigma: Floats,
+    azimuth: Sequence[Floats],
+    weight: Sequence[Floats],
+    learn: bool,
+) -> list[Fit]:
+    """Solve drives side by side, so many at a time that a day of driving fits into memory."""
     fits: list[Fit] = []
-    # so many at a time that a day of driving fits into memory
     rows = np.cumsum([len(drive) for drive in drives])
     for batch in np.unique(rows // _BATCH):
         which = np.flatnonzero(rows // _BATCH == batch).tolist()
         fits += _solved(
-            [with_speed(drives[i]) for i in which],
+            [drives[i] for i in which],
             settings,
-            start[which],
-            [azimuths[i] for i in which],
-            [weights[i] for i in which],
+            sigma[which],
+            [azimuth[i] for i in which],
+            [weight[i] for i in which],
             learn,
         )
     return fits
@@ -187,15 +231,12 @@ def _solved(
     drives: Sequence[Grid],
     settings: Chain,
     sigma: Floats,
-    azimuth: Sequence[Floats | None],
-    weight: Sequence[Floats | None],
+    azimuth: Sequence[Floats],
+    weight: Sequence[Floats],
     learn: bool,
 ) -> list[Fit]:
     rows = rows_of(drives)
-    given = zip(drives, azimuth, strict=True)
-    psi = np.concatenate([azimuth_of(drive) if first is None else first for drive, first in given])
-    own = zip(drives, weight, strict=True)
-    share = np.concatenate([np.ones(len(drive)) if first is None else first for drive, first in own])
+    psi, share = np.concatenate(azimuth), np.concatenate(weight)
     learns = settings.learns
     s2 = np.where(learns, sigma, _FLOOR) ** 2
     for k in range(settings.rounds):

@@ -174,6 +174,11 @@ def two_antenna(
     Returns
     -------
     Nonlinear
+
+    Raises
+    ------
+    BadValue
+        If `antennas` is neither 2 nor 1 without a `baseline`.
     """
     if antennas not in (1, 2) or (antennas == 1 and baseline is not None):
         raise BadValue(f"`antennas` is {antennas!r}, 2, or 1 without a `baseline`, is expected")
