@@ -183,7 +183,9 @@ def test_fixes_that_no_car_could_reach_are_named_with_time_and_size(drive):
     _, log = drive
     away = (log.t >= 150) & (log.t < 190)
     there = from_frame(shifted(log, away, 1000.0).frame())
-    assert any("400 fixes dropped that no car could reach, at 150.0 to 189.9 s by up to 10" in one for one in there.notes)
+    assert any(
+        "400 fixes dropped that no car could reach, at 150.0 to 189.9 s by up to 10" in one for one in there.notes
+    )
     frozen_there = from_frame(frozen(log, 160, 168).frame())
     assert any("frozen while the car moved, at 16" in note for note in frozen_there.notes)
     # a base that is set anew in the last fifth is not put right, but named in the same way
