@@ -131,6 +131,39 @@ def silent(_rng, log, gaps):
     return replace(log, yaw_rate_radps=np.where(rows, np.nan, log.yaw_rate_radps)), ""
 
 
+def drop(rng, log, gaps):
+    """Let the speed drop to 0 while the car drives, for a while, in the first gap or among fixes."""
+    begin, length = (gaps[0][0] + 2 if rng.uniform() < 0.5 else rng.uniform(110, 150)), rng.uniform(3, 20)
+    rows = (log.t > begin) & (log.t < begin + length)
+    moves = float(np.nanmax(np.where(rows, log.speed_mps, 0.0)))
+    return replace(
+        log, speed_mps=np.where(rows, 0.0, log.speed_mps)
+    ), f"{length:.0f} s at {begin:.0f} s, {moves:.0f} m/s"
+
+
+def from_some_time_on(name, factors):
+    def fault(rng, log, _gaps):
+        when, factor = rng.uniform(60, 200), float(rng.choice(factors))
+        return times(log, name, factor, when), f"{factor:.3g} at {when:.0f} s"
+
+    return fault
+
+
+def times(log, name, factor, when):
+    values = getattr(log, name)
+    return replace(log, **{name: np.where(log.t > when, factor * values, values)})
+
+
+def far_clock(rng, log, _gaps):
+    """Stamp speed and yaw rate by a clock that is seconds to minutes off."""
+    late = float(rng.choice([-1, 1]) * 10 ** rng.uniform(0.5, 2.2))
+    changed = {}
+    for name in ("speed_mps", "yaw_rate_radps"):
+        t, values = log.stream(name)
+        changed[name] = np.interp(log.t - late, t, values, left=np.nan, right=np.nan)
+    return replace(log, **changed), f"{late:.1f} s"
+
+
 def slow(_rng, log, _gaps):
     """Keep one row a second."""
     every = max(1, round(1.0 / float(np.median(np.diff(log.t)))))
@@ -162,6 +195,13 @@ FAULTS = {
     "silent": (silent, "without yaw rate"),
     "1 Hz": (slow, None),
 }
+#: Faults that are drawn where they are asked for by name only, so that older seeds stay what they were.
+ASKED = {
+    "drop": (drop, ("says 0", "stuck")),
+    "unit changes": (from_some_time_on("speed_mps", (3.6, 2.2369, 1 / 3.6)), "put right"),
+    "sign changes": (from_some_time_on("yaw_rate_radps", (-1.0, 180 / np.pi)), "put right"),
+    "far clock": (far_clock, "of the same moment"),
+}
 #: Faults that exclude each other.
 ALIKE = [
     {"sign", "degrees", "no yaw rate", "silent"},
@@ -169,6 +209,9 @@ ALIKE = [
     {"spikes", "no speed", "no yaw rate"},
     {"sensor clock", "no speed", "no yaw rate", "hang"},
     {"first fixes", "multipath"},
+    {"far clock", "no speed", "no yaw rate", "sensor clock", "clock step", "hang"},
+    {"unit changes", "drop", "no speed", "km/h", "mph", "scale", "stuck"},
+    {"sign changes", "sign", "degrees", "no yaw rate", "silent"},
 ]
 
 
@@ -201,8 +244,8 @@ def spoiled(rng, log, gaps, most, only):
         if len(names) < most and not any(name in kind and set(names) & kind for kind in ALIKE):
             names.append(str(name))
     words = []
-    for name in sorted(names, key=list(FAULTS).index):
-        log, size = FAULTS[name][0](rng, log, gaps)
+    for name in sorted(names, key=list(FAULTS | ASKED).index):
+        log, size = (FAULTS | ASKED)[name][0](rng, log, gaps)
         words.append(f"{name} {size}".strip())
     return log, names, ", ".join(words)
 
@@ -226,7 +269,7 @@ def unnamed(names, messages):
     said = " ".join(messages)
     found = []
     for name in names:
-        words = FAULTS[name][1]
+        words = (FAULTS | ASKED)[name][1]
         words = (words,) if isinstance(words, str) else words
         if words is not None and not any(word in said for word in words):
             found.append(name)
@@ -261,7 +304,7 @@ def main():
     parser.add_argument("--first", type=int, default=0, help="number of the first drive")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--faults", type=int, default=2, help="faults of a drive, at most")
-    parser.add_argument("--only", help="draw from these faults alone")
+    parser.add_argument("--only", help=f"draw from these faults alone; drawn only so: {', '.join(ASKED)}")
     parser.add_argument("--healthy", action="store_true", help="no faults: what is held against the drives?")
     asked = parser.parse_args()
     if asked.healthy:
@@ -289,7 +332,7 @@ def main():
         took = time.process_time() - began
         worst, share = judged(truth, track, gaps, to_true)
         straight, _ = judged(truth, hw.vehicle.fill(wrong, method="linear"), gaps, to_true)
-        whole = not ({"no speed", "no yaw rate", "silent", "stuck"} & set(names))
+        whole = not ({"no speed", "no yaw rate", "silent", "stuck", "drop", "far clock"} & set(names))
         poor = worst > 2 * clean + 1 and (whole or worst > straight + 1)
         bad += poor
         shares.append(share)

@@ -6,6 +6,7 @@
 namespace nb = nanobind;
 
 void bind_kalman(nb::module_& m);
+void bind_drive(nb::module_& m);
 void bind_tape(nb::module_& m);
 void bind_nonlinear(nb::module_& m);
 void bind_loss(nb::module_& m);
@@ -29,6 +30,7 @@ NB_MODULE(_core, m) {
     m.def("use_isa", [](bool avx2) { return hw::use_isa(avx2 ? hw::Isa::avx2 : hw::Isa::base); }, nb::arg("avx2"),
           "Run the kernels with AVX2 or without; False if this machine cannot. For tests.");
     bind_kalman(m);
+    bind_drive(m);
     bind_tape(m);
     bind_nonlinear(m);
     bind_loss(m);

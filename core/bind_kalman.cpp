@@ -4,10 +4,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
-#include <sys/mman.h>
-
 #include <atomic>
-#include <cstdlib>
 #include <map>
 #include <memory>
 #include <optional>
@@ -15,6 +12,7 @@
 #include <thread>
 #include <vector>
 
+#include "bind_array.hpp"
 #include "kalman.hpp"
 
 namespace nb = nanobind;
@@ -30,29 +28,6 @@ using Offsets = nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::d
 void need(bool ok, const char* what) {
     if (!ok) throw nb::value_error(what);
 }
-
-// A fresh float64 array. Large ones ask for huge pages: a first write then costs one fault per 2 MB, not per 4 KB.
-struct Fresh {
-    double* a = nullptr;
-    nb::object array;
-    explicit Fresh(std::initializer_list<std::int64_t> shape, bool zero = false) {
-        std::size_t s[4], n = 1, d = 0;
-        for (auto v : shape) {
-            s[d++] = static_cast<std::size_t>(v);
-            n *= static_cast<std::size_t>(v);
-        }
-        const std::size_t bytes = (n ? n : 1) * sizeof(double), huge = std::size_t{1} << 21;
-        void* p = nullptr;
-        if (posix_memalign(&p, bytes >= huge ? huge : 64, bytes) != 0) throw std::bad_alloc();
-#ifdef MADV_HUGEPAGE
-        if (bytes >= huge) madvise(p, bytes, MADV_HUGEPAGE);
-#endif
-        a = static_cast<double*>(p);
-        if (zero) for (std::size_t i = 0; i < n; i++) a[i] = 0.0;
-        nb::capsule owner(p, [](void* q) noexcept { std::free(q); });
-        array = nb::cast(nb::ndarray<nb::numpy, double>(a, d, s, owner));
-    }
-};
 
 // (m,n), (K,m,n) with K = 1, K = T (one per row), or any K with an index
 hw::Stack stack(const Array& a, const std::optional<Index>& index, std::int64_t T, std::int64_t m, std::int64_t n) {

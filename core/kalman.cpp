@@ -5,8 +5,8 @@ namespace hw {
 namespace HW_ISA {
 namespace {
 
-// f(Dim<nx>, Dim<ny>) with both sizes fixed for nx <= 8, ny <= 4, and for those that fill and calibrate a vehicle's
-// drive; at run time otherwise. A sanitizer build, which takes ten times longer to compile, has a few of the same
+// f(Dim<nx>, Dim<ny>) with both sizes fixed for nx <= 8, ny <= 4, and for those that calibrate a vehicle's sensors;
+// at run time otherwise. A sanitizer build, which takes ten times longer to compile, has a few of the same
 // templates.
 template <int N, class F>
 inline void with_outputs(int ny, F f) {
@@ -33,12 +33,8 @@ inline void with_sizes(int nx, int ny, F f) {
         case 6: return with_outputs<6>(ny, f);
         case 7: return with_outputs<7>(ny, f);
         case 8: return with_outputs<8>(ny, f);
-        case 9:  // the chain of a vehicle, and what calibrates its sensors
-            if (ny == 2) return f(Dim<9>(), Dim<2>());
+        case 9:  // what calibrates the sensors of a vehicle
             if (ny == 3) return f(Dim<9>(), Dim<3>());
-            break;
-        case 10:  // the chain where a yaw rate was silent
-            if (ny == 2) return f(Dim<10>(), Dim<2>());
             break;
         case 11:  // the same with an antenna off the axle
             if (ny == 3) return f(Dim<11>(), Dim<3>());

@@ -74,8 +74,15 @@ def rows(order):
     return make
 
 
-def late_restart(index):
+def late_restart(folder):
     """A second drive on the same clock behind the first."""
+    one, other = drive(), drive(seed=2)
+    both = {name: np.concatenate((one[name][:900], other[name][100:900])) for name in one}
+    return save(folder / "log.csv", both)
+
+
+def written_twice(index):
+    """A part of the drive appended again."""
     return np.concatenate((index[:900], index[100:900]))
 
 
@@ -189,7 +196,8 @@ CASES = [
     ("no time in any row", changed(t_s=lambda v: [""] * 1200), BAD, "holds no time in any row"),
     ("time backwards once", rows(lambda k: np.r_[k[:500], k[500:503][::-1], k[503:]]), GOOD, "time went backwards 2"),
     ("rows reversed", rows(lambda k: k[::-1]), GOOD, "rows ran backwards in time: turned around"),
-    ("clock restarts", rows(late_restart), BAD, "restarts its clock: row 901"),
+    ("clock restarts", late_restart, BAD, "restarts its clock: row 901"),
+    ("rows twice", rows(written_twice), GOOD, "800 rows dropped, each there twice"),
     ("times shuffled", rows(lambda k: np.random.default_rng(1).permutation(k)), GOOD, "no order of time: sorted"),
     ("times all equal", changed(t_s=lambda v: v * 0), BAD, "only one row has a position"),
     ("duplicate rows", rows(lambda k: np.sort(np.r_[k, k[100:110]])), GOOD, "10 rows with the time of the row before"),

@@ -8,7 +8,7 @@ from tests.vehicle.known import known
 from halfwidth.result import Status
 from halfwidth.vehicle import chain
 from halfwidth.vehicle.grid import sampled
-from halfwidth.vehicle.pointing import azimuth_of
+from halfwidth.vehicle.pointing import _smooth, azimuth_of
 
 GAUSSIAN = {"tail": np.inf}
 SIGMA = np.array([0.1, 0.05, 0.1, 0.01, 0.3, 0.1, 0.3])
@@ -172,3 +172,16 @@ def test_a_first_azimuth_points_along_the_way():
     off = np.angle(np.exp(1j * (azimuth_of(drive) - true)))
     assert np.abs(off).max() < 0.6
     assert np.abs(off[drive.seen]).mean() < 0.1
+
+
+def test_what_points_somewhere_counts_by_how_near_it_is():
+    knots = np.linspace(0.0, 900.0, 182)
+    rng = np.random.default_rng(1)
+    when = np.sort(np.concatenate((rng.uniform(0, 200, 300), rng.uniform(600, 900, 300))))
+    pointing = np.exp(1j * rng.normal(size=600))
+    away2 = ((knots[:, None] - when) / 15.0) ** 2
+    want = np.exp(-0.5 * (away2 - away2.min(axis=1, keepdims=True))) @ pointing
+    order = rng.permutation(600)
+    for some in (slice(None), order):
+        np.testing.assert_allclose(_smooth(knots, when[some], pointing[some]), want, rtol=1e-9)
+    np.testing.assert_allclose(_smooth(knots, when[:1], pointing[:1]), np.repeat(pointing[:1], knots.size))

@@ -11,7 +11,7 @@ import pytest
 from halfwidth.vehicle import check, fill, simulate_drive
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.check_sensors import items
-from halfwidth.vehicle.formats import read
+from halfwidth.vehicle.formats import from_frame, read
 from halfwidth.vehicle.grid import sampled
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.stray import strays
@@ -167,6 +167,36 @@ def test_a_wrong_sign_or_unit_is_named_and_put_right(drive, clean, field, factor
     item = check(wrong)["speed" if field == "speed_mps" else "yaw rate"]
     assert item.verdict == "bad"
     assert item.line
+
+
+def test_an_azimuth_that_points_elsewhere_is_named_and_turned(drive, clean):
+    truth, log = drive
+    track = fill(replace(log, azimuth_rad=(log.azimuth_rad + np.pi) % (2 * np.pi)))
+    assert said(track, "clockwise from south")
+    assert in_gaps(truth, track) < 1.2 * clean + 0.1
+    aside = calibrated(replace(log, azimuth_rad=(log.azimuth_rad + np.pi / 2) % (2 * np.pi)))
+    assert "the azimuth points +90 degrees off" in aside.messages[-1]
+    assert aside.course_error == pytest.approx(np.pi / 2, abs=0.02)
+
+
+def test_fixes_that_no_car_could_reach_are_named_with_time_and_size(drive):
+    _, log = drive
+    away = (log.t >= 150) & (log.t < 190)
+    there = from_frame(shifted(log, away, 1000.0).frame())
+    assert any(
+        "400 fixes dropped that no car could reach, at 150.0 to 189.9 s by up to 10" in one for one in there.notes
+    )
+    frozen_there = from_frame(frozen(log, 160, 168).frame())
+    assert any("frozen while the car moved, at 16" in note for note in frozen_there.notes)
+    # a base that is set anew in the last fifth is not put right, but named in the same way
+    item = check(from_frame(shifted(log, log.t > 70, 1000.0).frame().iloc[:900]))["outliers"]
+    assert item.verdict == "bad"
+    assert "70.1 to 89.9 s by up to 10" in item.sentence
+
+
+def test_few_fixes_are_counted_as_the_log_has_them():
+    log = Log(t=[0.0, 0.1, 5.0, 5.1, 10.0], lat_deg=[50.0, 50.0, 50.0, 50.0, np.nan], lon_deg=[14, 14, 14, 14, np.nan])
+    assert said(fill(log), "the log has only 4 fixes, 2 of them of use")
 
 
 def test_without_a_speed_a_gap_is_still_bridged(drive):

@@ -132,7 +132,21 @@ def test_the_plot_has_a_line_for_each_method_and_one_for_the_tolerance(table):
     ax = table.plot(tolerance=0.5)
     assert len(ax.lines) == 2 * len(table.methods) + 1
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert labels == [*table.methods, "tolerance 0.5 m"]
+    longest = [table.cell(name, max(table.lengths)).mean for name in labels[:-1]]
+    assert longest == sorted(longest)
+    assert {*labels} == {*table.methods, "tolerance 0.5 m"}
+
+
+def test_the_plot_of_one_length_has_a_row_for_each_method(log):
+    pytest.importorskip("matplotlib").use("Agg")
+    table = outages(log, (5,), 2, 1, ("linear", "cv"))
+    ax = table.plot()
+    rows = {label.get_text(): place for label, place in zip(ax.get_yticklabels(), ax.get_yticks(), strict=True)}
+    for name in table.methods:
+        cell = table.cell(name, 5)
+        (line,) = (line for line in ax.lines if line.get_label() == name)
+        np.testing.assert_allclose(line.get_xdata(), [cell.mean, cell.max])
+        assert set(line.get_ydata()) == {rows[name]}
 
 
 def test_clocks_are_found_if_none_is_given():

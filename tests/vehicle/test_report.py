@@ -1,6 +1,7 @@
 """The report: what it says, that it is inert and asks nothing, and how it behaves in a browser."""
 
 import base64
+import dataclasses
 import hashlib
 import html
 import io
@@ -18,7 +19,7 @@ import pytest
 from tests.vehicle.browser import CHROMIUM, Browser
 from tests.vehicle.made_tracks import made_track
 
-from halfwidth.vehicle import picture
+from halfwidth.vehicle import fill, picture
 from halfwidth.vehicle.drive import simulate_drive
 from halfwidth.vehicle.report import notebook, page, verdict
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
@@ -152,7 +153,7 @@ def test_table_of_gaps_has_every_gap():
             f"{gap.start:.1f}",
             f"{gap.stop:.1f}",
             f"{gap.duration_s:.1f}",
-            f"{gap.distance_m:.0f}",
+            f"{gap.distance_m:.{0 if gap.distance_m >= 10 else 1}f}",
             f"{gap.max_half_m:.2f}",
             gap.quality,
         ]
@@ -203,8 +204,6 @@ def test_faults_of_the_log_are_named():
     text = Reader(page(made_track())).text()
     assert "looked at" in text
     assert "While reading" not in text
-    import dataclasses
-
     track = made_track()
     track = dataclasses.replace(track, log=dataclasses.replace(track.log, notes=("2 rows dropped",)))
     assert "2 rows dropped" in Reader(page(track)).text()
@@ -826,3 +825,26 @@ def test_page_stands_without_its_script(browser, drive):
         assert seen[".tools"] == seen[".cursor"] == 0
     finally:
         browser("Emulation.setScriptExecutionDisabled", value=False)
+
+
+def test_what_was_left_out_is_among_the_faults_of_the_log():
+    _, log = simulate_drive(duration=120.0, rate=5.0, fix_rate=5.0, outages=((50.0, 60.0),), seed=3)
+    speed = log.speed_mps.copy()
+    speed[200] = 60.0
+    track = fill(dataclasses.replace(log, speed_mps=speed))
+    assert track.log.speed_mps[200] == 60.0
+    text = Reader(page(track)).text().replace("\u00a0", " ")
+    assert "1 fault found" in text
+    assert text.count("1 sample of the speed that no car can have had") == 2  # a message, and a point of the log
+
+
+def test_kinds_of_hidden_stretches_are_told_apart_and_settings_have_rows():
+    row = {"length_s": 5.0, "stretches": 9, "mean_m": 1.0, "max_m": 2.0, "coverage": 0.9, "inflation": 1.2}
+    rows = [row, row | {"side": "one", "silent": ("speed", "yaw_rate"), "by": "cv"}]
+    text = Reader(page(made_track(benchmark=rows))).text().replace("\n", " ")
+    assert "beyond the fixes without speed and yaw rate, by cv" in text
+    assert "hidden for, s stretches" in Reader(page(made_track(benchmark=[row]))).text().replace("\n", " ")
+    track = made_track()
+    nested = dataclasses.replace(track, settings={"sensors": {"yaw_bias_at": [[1.0, 2.0], [3.0, 4.0]], "steps": {}}})
+    text = Reader(page(nested)).text().replace("\n", " ")
+    assert "sensors, yaw bias at 1, 2; 3, 4" in text

@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 from tests.vehicle.known import known
 
+from halfwidth.errors import BadLog
 from halfwidth.vehicle import simulate_drive
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.formats import from_frame
@@ -68,3 +69,48 @@ def test_fixes_of_a_clock_of_whole_seconds_are_not_left_out(every):
     assert not stamps.moved
     sensors = calibrated(same)
     assert not strays(sampled(same, sensors=sensors), sensors).at.size
+
+
+def table(log):
+    """A log as a table without its rows' order."""
+    named = {
+        "time": log.t,
+        "lat": log.lat_deg,
+        "lon": log.lon_deg,
+        "speed": log.speed_mps,
+        "yaw_rate": log.yaw_rate_radps,
+    }
+    return pd.DataFrame(named)
+
+
+@pytest.mark.parametrize(("period", "name"), [(86_400.0, "day"), (604_800.0, "week"), (2**32 * 1e-6, "count of us")])
+@pytest.mark.parametrize("late", [0, 1])
+def test_a_clock_that_begins_anew_is_counted_on(period, name, late):
+    _, log = simulate_drive(duration=60, seed=5, tunnels=())
+    rows = table(log)
+    rows["time"] = (rows.time + period - 25.0) % period
+    order = np.arange(len(rows))
+    k = int(np.flatnonzero(np.diff(rows.time) < 0)[0])
+    order[k : k + 1 + late] = order[k : k + 1 + late][::-1]  # two rows that passed each other at the turn
+    read = from_frame(rows.iloc[order])
+    assert len(read) == len(log)
+    assert np.allclose(np.diff(read.t), np.diff(log.t))
+    assert any(f"begins anew with each {name}, 1 time" in note for note in read.notes)
+
+
+def test_rows_that_are_there_twice_in_no_order_are_one_drive():
+    _, log = simulate_drive(duration=60, seed=5, tunnels=())
+    rows = table(log)
+    twice = pd.concat([rows, rows.iloc[::7]]).sample(frac=1, random_state=1)
+    for given in (twice, pd.concat([rows, rows])):
+        read = from_frame(given)
+        assert np.array_equal(read.t, log.t)
+        assert np.array_equal(read.speed_mps, log.speed_mps)
+        assert any("each there twice" in note for note in read.notes)
+
+
+def test_two_drives_on_one_clock_are_still_refused():
+    rows = table(simulate_drive(duration=60, seed=5, tunnels=())[1])
+    other = table(simulate_drive(duration=60, seed=6, tunnels=())[1])
+    with pytest.raises(BadLog, match="restarts its clock"):
+        from_frame(pd.concat([rows, other]))

@@ -95,3 +95,25 @@ def test_without_a_speed_wrong_first_fixes_do_not_bend_a_gap():
     track = fill(wrong)
     assert any("lie off the path of the others" in message for message in track.messages)
     assert worst(track) < 1.5 * worst(fill(log)) + 1.0
+
+
+def test_integrals_are_exact_and_say_what_they_cannot_tell():
+    rng = np.random.default_rng(4)
+    t = np.cumsum(rng.uniform(0.05, 0.2, 200))
+    t[100:] += 5.0  # a pause
+    values = rng.normal(size=200)
+    start = rng.uniform(-1, t[-1] + 1, 300)
+    stop = start + rng.uniform(0, 4, 300)
+    late = np.array([-0.7, 0.0, 1.3])
+    got = evidence.integrals(t, values, start, stop, late)
+    for k, by in enumerate(late):
+        clock = t + by
+        for a, b, one in zip(start, stop, got[:, k], strict=True):
+            paused = (a < clock[100]) and (b > clock[99])
+            if a < clock[0] or b > clock[-1] or paused:
+                assert np.isnan(one)
+            else:
+                inside = clock[(clock > a) & (clock < b)]
+                x = np.concatenate(([a], inside, [b]))
+                assert one == pytest.approx(np.trapezoid(np.interp(x, clock, values), x), abs=1e-12)
+    assert np.isnan(evidence.integral(t[:1], values[:1], start, stop)).all()

@@ -47,6 +47,9 @@ KNOT = 30.0
 #: Rounds with the antenna on the axle, then off it.
 _ROUNDS, _MORE = 12, 6
 
+#: An azimuth that is further off than this is worth a word, rad.
+_TURNED = 0.35
+
 _SENSORS = ("speed", "yaw_rate")
 
 
@@ -429,8 +432,12 @@ def _azimuth(log: Log, known: Calibration, pieces: Sequence[reckoning.Piece]) ->
         blocks += [np.flatnonzero(inside)[i : i + 200] for i in range(0, int(inside.sum()), 200)]
     path = _continuous(np.concatenate([np.column_stack((piece.t, piece.azimuth)) for piece in pieces]))
     rate = np.gradient(path[:, 1], path[:, 0])
-    offset, error, sd = 0.0, 0.0, float("inf")
     v = np.interp(t, *known.stream(log, "speed")) if "speed" in known.offsets else np.full(t.size, 10.0)
+    # a receiver, or a pair of antennas, may sit turned round
+    off = wrapped(given - np.interp(t, path[:, 0], path[:, 1]))[np.abs(v) > 2.0]
+    mean = np.exp(1j * off).mean() if off.size else 1.0
+    error = float(np.angle(mean)) if abs(mean) > 0.9 else 0.0
+    offset, sd = 0.0, float("inf")
     for _ in range(5):
         off = wrapped(given - np.interp(t + offset, path[:, 0], path[:, 1]))
         turn = np.interp(t + offset, path[:, 0], rate)
@@ -454,4 +461,6 @@ def _azimuth(log: Log, known: Calibration, pieces: Sequence[reckoning.Piece]) ->
         error = float(found[1])
     observable = bool(sd < OBSERVABLE and len(rows) >= 3)
     offsets = {**known.offsets, "azimuth": Offset(offset, sd, observable)}
-    return replace(known, offsets=offsets, course_error=error)
+    said = f"the azimuth points {np.degrees(error):+.0f} degrees off the way that the fixes go: turned by that"
+    messages = (*known.messages, said) if abs(error) > _TURNED else known.messages
+    return replace(known, offsets=offsets, course_error=error, messages=messages)

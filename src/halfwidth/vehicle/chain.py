@@ -238,15 +238,17 @@ def _solved(
     rows = rows_of(drives)
     psi, share = np.concatenate(azimuth), np.concatenate(weight)
     learns = settings.learns
+    jumps = settings.slow and bool(np.isfinite(settings.tail))
     s2 = np.where(learns, sigma, _FLOOR) ** 2
     for k in range(settings.rounds):
+        last = k == settings.rounds - 1
         line = _linearised(rows, psi)
-        out = _smoothed(rows, line, s2, share, settings)
+        out = _smoothed(rows, line, s2, share, settings, squares=not last and (learn or jumps), covariances=last)
         found = out.x[:, AZIMUTH]
         psi = np.where(np.isfinite(found), found, psi)
-        if k < settings.rounds - 1:
-            squares = _squares(rows, line, out)
-            if settings.slow and np.isfinite(settings.tail):
+        if out.squares.size:
+            squares = _squares(rows, out.squares)
+            if jumps:
                 share = _shares(rows, squares[:, OFFSET], s2, settings.tail)
             if learn:
                 s2 = np.where(learns, _learnt(rows, squares, share, out, s2), s2)
@@ -255,41 +257,19 @@ def _solved(
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """The linear model about one azimuth: ``z[k] = A z[k-1] + b + w``."""
+    """The azimuths that a linear model is about, in the middle of the steps, (R,), with their sines and cosines."""
 
-    A: Floats  # (R, 9, 9)
-    b: Floats  # (R, 9)
-    S: Floats  # (R,) sine and cosine of the middle azimuth
+    middle: Floats
+    S: Floats
     C: Floats
-    half: Floats  # (R,) v h / 2
 
 
 def _linearised(rows: Rows, psi: Floats) -> _Line:
-    """Solve the residuals for the new state, about the azimuths psi."""
-    h, v, w = rows.h, rows.v, rows.w
+    """Linearise the residuals about the azimuths psi."""
     middle = psi.copy()
     middle[1:] = 0.5 * (psi[1:] + psi[:-1])
     middle[rows.first] = psi[rows.first]
-    S, C, vh = np.sin(middle), np.cos(middle), v * h
-    size = SIZE + (rows.turn is not None)
-    A = np.zeros((h.size, size, size))
-    A[:, range(SIZE), range(SIZE)] = 1.0
-    A[:, E, AZIMUTH], A[:, E, SCALE], A[:, E, BIAS] = C * vh, S * vh, 0.5 * C * vh * h
-    A[:, N, AZIMUTH], A[:, N, SCALE], A[:, N, BIAS] = -S * vh, C * vh, -0.5 * S * vh * h
-    A[:, AZIMUTH, BIAS] = h
-    if rows.turn is not None:
-        A[:, [E, N, AZIMUTH], TURN] = -rows.turn.size[:, None] * A[:, [E, N, AZIMUTH], BIAS]
-        A[:, TURN, TURN] = rows.turn.keep
-    aside = vh * (-0.5 * h * w - middle)
-    b = np.zeros((h.size, size))
-    b[:, E], b[:, N], b[:, AZIMUTH] = C * aside, -S * aside, -h * w
-    A[rows.first] = np.eye(size)
-    b[rows.first] = 0.0
-    return _Line(A, b, S, C, 0.5 * vh)
-
-
-_OUT = np.zeros((2, SIZE + 1))
-_OUT[0, [E, OFFSET_E]] = _OUT[1, [N, OFFSET_N]] = 1.0
+    return _Line(middle, np.sin(middle), np.cos(middle))
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,78 +277,65 @@ class _Smoothed:
     """What the core returns, one drive below the other."""
 
     x: Floats  # (R, 9)
-    P: Floats  # (R, 9, 9)
-    W: Floats  # (R, 9, 9) expected squares of the state noise, given all fixes
-    V: Floats  # (n, 2, 2) their sums of the output noise
+    P: Floats  # (R, 9, 9), and
+    squares: Floats  # (R, 5) expected squares of the residuals, given all fixes: empty where they are not asked for
+    misfit: Floats  # (n,) sums of the expected squares of what fixes are off, both axes
     counted: Floats  # (n,) and counts
     loglik: Floats  # (n,)
-    code: NDArray[np.int64]  # (n,)
+    code: Sequence[int]  # (n,)
 
 
-def _smoothed(rows: Rows, line: _Line, s2: Floats, share: Floats, settings: Chain) -> _Smoothed:
+def _smoothed(
+    rows: Rows, line: _Line, s2: Floats, share: Floats, settings: Chain, *, squares: bool, covariances: bool
+) -> _Smoothed:
     """Run the smoother of the core over all drives; s2 (n, 7) are squared scales, share (R,) weights of increments."""
     h, n = rows.h, len(rows.origin)
-    A = line.A.copy()
-    inner = ~rows.first
-    fade, drift_fade = np.exp(-h / settings.memory)[inner], np.exp(-h / settings.drift_memory)[inner]
-    A[inner, OFFSET_E, OFFSET_E] = A[inner, OFFSET_N, OFFSET_N] = fade
-    A[inner, OFFSET_E, DRIFT_E] = A[inner, OFFSET_N, DRIFT_N] = h[inner]
-    A[inner, DRIFT_E, DRIFT_E] = A[inner, DRIFT_N, DRIFT_N] = drift_fade
     own = s2[rows.drive]
     along, aside, yaw = _variances(rows, own)
-    # the noise of the rotated residuals, in the axes of the state
-    across = aside + line.half**2 * yaw
-    size = A.shape[1]
-    Q = np.zeros((h.size, size, size))
-    S, C = line.S, line.C
-    Q[:, E, E] = S * S * along + C * C * across
-    Q[:, N, N] = C * C * along + S * S * across
-    Q[:, E, N] = Q[:, N, E] = S * C * (along - across)
-    Q[:, E, AZIMUTH] = Q[:, AZIMUTH, E] = C * line.half * yaw
-    Q[:, N, AZIMUTH] = Q[:, AZIMUTH, N] = -S * line.half * yaw
-    Q[:, AZIMUTH, AZIMUTH] = yaw
-    Q[:, OFFSET_E, OFFSET_E] = Q[:, OFFSET_N, OFFSET_N] = own[:, OFFSET] * h / share
-    Q[:, DRIFT_E, DRIFT_E] = Q[:, DRIFT_N, DRIFT_N] = own[:, DRIFT] * h
-    Q[:, SCALE, SCALE] = settings.scale_walk**2 * h
-    Q[:, BIAS, BIAS] = settings.bias_walk**2 * h
-    if rows.turn is not None:
-        Q[:, TURN, TURN] = rows.turn.q
-    Q[rows.first] = 0.0
+    size = SIZE + (rows.turn is not None)
     start = rows.offsets[:-1]
-    x0, P0 = np.zeros((n, size)), np.zeros((n, size, size))
+    x0, P0 = np.zeros((n, size)), np.zeros((n, size))
     x0[:, SCALE] = 1.0
-    x0[:, AZIMUTH] = np.arctan2(S[start], C[start])
+    x0[:, AZIMUTH] = np.arctan2(line.S[start], line.C[start])
     offset, drift = _stationary(s2, settings)
-    P0[:, E, E] = P0[:, N, N] = rows.far**2
-    P0[:, AZIMUTH, AZIMUTH] = 10.0
-    P0[:, OFFSET_E, OFFSET_E] = P0[:, OFFSET_N, OFFSET_N] = offset
-    P0[:, DRIFT_E, DRIFT_E] = P0[:, DRIFT_N, DRIFT_N] = drift
-    P0[:, SCALE, SCALE], P0[:, BIAS, BIAS] = settings.scale_sd**2, settings.bias_sd**2
+    P0[:, E] = P0[:, N] = rows.far**2
+    P0[:, AZIMUTH] = 10.0
+    P0[:, OFFSET_E] = P0[:, OFFSET_N] = offset
+    P0[:, DRIFT_E] = P0[:, DRIFT_N] = drift
+    P0[:, SCALE], P0[:, BIAS] = settings.scale_sd**2, settings.bias_sd**2
+    turn = {}
     if rows.turn is not None:
-        P0[:, TURN, TURN] = 1.0
-    # one drive at a time: the sums of the core are kept for each row of Q, so they cannot be shared between drives
-    parts = []
-    for i in range(n):
-        part = slice(int(rows.offsets[i]), int(rows.offsets[i + 1]))
-        parts.append(
-            _core.kalman_run(
-                "smooth",
-                A[part],
-                None,
-                _OUT[:, :size],
-                Q[part],
-                s2[i, FIX] * np.eye(2),
-                rows.y[part],
-                rows.seen[part],
-                x0[i],
-                P0[i],
-                b=line.b[part],
-                sums=True,
-                threads=1,
-            )
-        )
+        P0[:, TURN] = 1.0
+        turn = {"turn": rows.turn.size, "stay": rows.turn.keep, "q_turn": rows.turn.q}
     return _Smoothed(
-        *(np.concatenate([part[name] for part in parts]) for name in ("x", "P", "W", "V", "nV", "loglik", "code"))
+        **{"P": np.empty(0), "squares": np.empty(0)}
+        | _core.drive_smooth(
+            offsets=rows.offsets,
+            order=rows.order,
+            h=h,
+            d=rows.v * h,
+            w=rows.w,
+            middle=line.middle,
+            S=line.S,
+            C=line.C,
+            along=along,
+            aside=aside,
+            yaw=yaw,
+            keep=np.exp(-h / settings.memory),
+            fade=np.exp(-h / settings.drift_memory),
+            q_offset=own[:, OFFSET] * h / share,
+            q_drift=own[:, DRIFT] * h,
+            scale_walk=settings.scale_walk**2,
+            bias_walk=settings.bias_walk**2,
+            y=rows.y,
+            seen=rows.seen,
+            r=np.ascontiguousarray(s2[:, FIX]),
+            x0=x0,
+            P0=P0,
+            covariances=covariances,
+            squares=squares,
+            **turn,
+        )
     )
 
 
@@ -385,24 +352,12 @@ def _stationary(s2: Floats, settings: Chain) -> tuple[Floats, Floats]:
     return 0.5 * m * s2[..., OFFSET] + drift * m * m * d / (m + d), drift
 
 
-def _squares(rows: Rows, line: _Line, out: _Smoothed) -> Floats:
+def _squares(rows: Rows, found: Floats) -> Floats:
     """Return posterior squared residuals (R, 6) over their squared weights; of the lateral one before it is shared."""
-    W, S, C, c = out.W, line.S, line.C, line.half
-    squares = np.empty((rows.h.size, 6))
-    squares[:, 0] = S * S * W[:, E, E] + 2 * S * C * W[:, E, N] + C * C * W[:, N, N]
-    squares[:, LATERAL] = (
-        C * C * W[:, E, E]
-        - 2 * S * C * W[:, E, N]
-        + S * S * W[:, N, N]
-        - 2 * c * (C * W[:, E, AZIMUTH] - S * W[:, N, AZIMUTH])
-        + c * c * W[:, AZIMUTH, AZIMUTH]
-    )
-    squares[:, SLIP] = squares[:, LATERAL]
-    squares[:, YAW] = W[:, AZIMUTH, AZIMUTH]
-    squares[:, [0, YAW]] /= rows.weight2[:, [0, YAW]]
-    squares[:, OFFSET] = 0.5 * (W[:, OFFSET_E, OFFSET_E] + W[:, OFFSET_N, OFFSET_N]) / rows.h
-    squares[:, DRIFT] = 0.5 * (W[:, DRIFT_E, DRIFT_E] + W[:, DRIFT_N, DRIFT_N]) / rows.h
-    return np.maximum(squares, 0.0)
+    along, aside, yaw, offset, drift = found.T
+    squares = np.column_stack((along, aside, aside, yaw, 0.5 * offset / rows.h, 0.5 * drift / rows.h))
+    squares[:, [LONGITUDINAL, YAW]] /= rows.weight2[:, [LONGITUDINAL, YAW]]
+    return squares
 
 
 def _shares(rows: Rows, square: Floats, s2: Floats, tail: float) -> Floats:
@@ -424,26 +379,19 @@ def _learnt(rows: Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Floa
     Rows where a sensor was silent are left out. One pseudo-row at the present value keeps a short drive from learning
     that it has no noise. The lateral residual is shared between its two groups by their present variances.
     """
-    own = s2[rows.drive]
-    parts = own[:, [LATERAL, SLIP]] * rows.weight2[:, [LATERAL, SLIP]]
-    whole = parts.sum(axis=1)
-    n = len(rows.origin)
+    aside = [LATERAL, SLIP]
+    own = s2[rows.drive][:, aside]
+    parts = own * rows.weight2[:, aside]
+    whole = parts.sum(axis=1, keepdims=True)
+    count, value = np.ones(squares.shape), squares.copy()
+    count[:, aside] = parts / whole
+    value[:, aside] *= parts * own / whole**2
+    value[:, OFFSET] *= share
+    keep = rows.counted & np.isfinite(squares)
+    total, counts = (np.add.reduceat(np.where(keep, one, 0.0), rows.offsets[:-1]) for one in (value, count))
     new = s2.copy()
-    for g, sensor in ((LONGITUDINAL, 0), (LATERAL, 1), (SLIP, 1), (YAW, 2), (OFFSET, -1), (DRIFT, -1)):
-        keep = ~rows.first & np.isfinite(squares[:, g])
-        if sensor >= 0:
-            keep &= ~rows.unknown[:, sensor]
-        of = rows.drive[keep]
-        counted = np.ones(of.size)
-        value = squares[keep, g]
-        if g in (LATERAL, SLIP):
-            counted = parts[keep, g - LATERAL] / whole[keep]
-            value = counted * own[keep, g] * value / whole[keep]
-        elif g == OFFSET:
-            value = value * share[keep]
-        new[:, g] = (np.bincount(of, value, n) + s2[:, g]) / (np.bincount(of, counted, n) + 1.0)
-    V = out.V
-    new[:, FIX] = (0.5 * (V[:, 0, 0] + V[:, 1, 1]) + s2[:, FIX]) / (out.counted + 1.0)
+    new[:, :FIX] = (total + s2[:, :FIX]) / (counts + 1.0)
+    new[:, FIX] = (0.5 * out.misfit + s2[:, FIX]) / (out.counted + 1.0)
     new = np.where(np.isfinite(new), new, s2)
     return np.clip(new, _FLOOR**2, _CEILING**2)
 

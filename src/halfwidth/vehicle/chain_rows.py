@@ -18,6 +18,7 @@ class Rows:
     """All nodes of all drives, one drive below the other; R rows, n drives."""
 
     offsets: NDArray[np.int64]  # (n + 1,)
+    order: NDArray[np.int32]  # (n,) drives, the longest first: those that are solved side by side are about as long
     drive: NDArray[np.int32]  # (R,)
     first: Mask  # (R,)
     h: Floats
@@ -28,8 +29,8 @@ class Rows:
     extra: Floats  # (R, 3) variance added to longitudinal, lateral and yaw where a sensor was silent
     gap: Mask  # (R,) whether the step lies in a gap between fixes
     y: Floats  # (R, 2) fixes, about the first of each drive
-    seen: Mask  # (R, 2)
-    unknown: Mask  # (R, 3) where a sensor was silent
+    seen: Mask  # (R,)
+    counted: Mask  # (R, 6) whether the scales of the first six groups are learnt from a row: no sensor was silent there
     origin: Floats  # (n, 2)
     far: Floats  # (n,) how far the first node may be from the first fix, m
 
@@ -59,7 +60,8 @@ def rows_of(drives: Sequence[Grid]) -> Rows:
     # a step of unknown speed may also slide: without this the lateral row would trust a wrong displacement
     lost_speed, lost_yaw = h * all_of("speed_sd"), h * all_of("yaw_rate_sd")
     extra = np.column_stack((lost_speed**2, (0.02 * lost_speed) ** 2, lost_yaw**2))
-    unknown = extra > 0
+    spoke = (extra == 0) & ~first[:, None]
+    counted = np.column_stack((spoke[:, [0, 1, 1, 2]], ~first, ~first))
     turn = None
     if any(drive.has_yaw_rate and (drive.yaw_rate_sd > 0).any() for drive in drives):
         turn = joined([bridged(drive) for drive in drives])
@@ -76,6 +78,7 @@ def rows_of(drives: Sequence[Grid]) -> Rows:
     gap = np.concatenate([in_gap(drive) for drive in drives])
     return Rows(
         offsets,
+        np.argsort(-sizes, kind="stable").astype(np.int32),
         index,
         first,
         h,
@@ -86,8 +89,8 @@ def rows_of(drives: Sequence[Grid]) -> Rows:
         extra,
         gap,
         y,
-        np.column_stack((seen, seen)),
-        unknown,
+        seen,
+        counted,
         origin,
         far,
     )

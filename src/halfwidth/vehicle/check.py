@@ -24,6 +24,7 @@ from halfwidth.vehicle.sensors import Calibration
 from halfwidth.vehicle.spikes import spikes
 from halfwidth.vehicle.stamps import Stamps, delays, restamped
 from halfwidth.vehicle.units import (
+    azimuth_put_right,
     contradicted_convention,
     contradicted_yaw,
     matched_factor,
@@ -211,6 +212,8 @@ def check(log: Any) -> Check:
     elif not isinstance(log, Log):
         log = from_frame(log, repair=False)
     leaping, log = _spikes(log)
+    far, log = check_sensors.far_clock(log)
+    lapsing, log = check_sensors.lapsing(log)
     swapped = _swapped(log)
     basis = None
     if swapped.verdict == "bad":
@@ -226,6 +229,7 @@ def check(log: Any) -> Check:
             first = "put the time right first"
             moving += [trust, *(Item(name, "not checked", first) for name in ("stamps", *check_sensors.NAMES))]
         else:
+            believed, _ = azimuth_put_right(believed)
             said, stamps = restamped(believed)
             known = calibrated(said)
             basis = Basis(said, log, known, stamps, doubted)
@@ -236,6 +240,8 @@ def check(log: Any) -> Check:
         _gaps(log),
         _pauses(log, () if basis is None else basis.stamps.leaps),
         leaping,
+        far,
+        lapsing,
         swapped,
         *moving,
         *_steps(log, steps_of(log)),
@@ -359,12 +365,11 @@ def _outliers(log: Log) -> Item:
     share = float(bad.mean())
     if not bad.any():
         return Item("outliers", "ok", "no fix jumps further than speed and fix error explain", 0.0)
-    times = ", ".join(f"{when:.1f}" for when in t[bad][:5])
-    more = ", ..." if int(bad.sum()) > 5 else ""
+    when = evidence.times_of(t, bad, evidence.off_line(t, position[:, 0], position[:, 1], bad))
     return Item(
         "outliers",
         "bad" if share > 0.05 else "warn",
-        f"{int(bad.sum())} of {bad.size} fixes jump further than a speed of {top:.0f} m/s explains, at {times}{more} s",
+        f"{int(bad.sum())} of {bad.size} fixes jump further than a speed of {top:.0f} m/s explains, at {when}",
         float(bad.sum()),
         line=check_sensors.fill_line(log),
     )

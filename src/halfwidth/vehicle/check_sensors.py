@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from halfwidth.vehicle import adrift
 from halfwidth.vehicle.align import EDGE
 from halfwidth.vehicle.grid import sampled
+from halfwidth.vehicle.lapses import lapses, put_right
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.sensors import STREAM, Calibration, Offset
 from halfwidth.vehicle.stamps import Stamps
@@ -91,6 +93,27 @@ def fill_line(log: Log) -> str:
     """Return the command that fills a log."""
     source = log.source or "LOG"
     return f"halfwidth fill {shlex.quote(source)} -o track.gpx"
+
+
+def far_clock(log: Log) -> tuple[Item, Log]:
+    """Look for a clock of the sensors that is far off; return the log with them moved."""
+    seconds = adrift.adrift(log)
+    if seconds is None:
+        text = f"speed and fixes are within {adrift.NEAR:g} s of each other as far as stops and starts tell"
+        return Item("sensor clock", "ok", text, 0.0, "s"), log
+    said = adrift.words(seconds).removesuffix(": moved")
+    item = Item("sensor clock", "bad", f"{said}; fill moves them", seconds, "s", fill_line(log))
+    return item, adrift.moved(log, seconds)
+
+
+def lapsing(log: Log) -> tuple[Item, Log]:
+    """Look for stretches in which speed or yaw rate contradict the fixes; return the log with them put right."""
+    found = lapses(log)
+    if not found:
+        return Item("lapses", "ok", "no stretch of the speed or yaw rate contradicts the fixes by a factor", 0.0), log
+    said = "; ".join(lapse.words(log) for lapse in found).replace(": put right", "").replace(": not used", "")
+    item = Item("lapses", "bad", said, float(len(found)), line=fill_line(log))
+    return item, put_right(log, found)
 
 
 def items(log: Log, known: Calibration, stamps: Stamps | None = None) -> list[Item]:

@@ -96,11 +96,10 @@ class Distrust:
         ):
             rows = self.of(why)
             if rows.size:
-                spans = _spans(log.t, rows, np.flatnonzero(log.fixed))
-                listed = ", ".join(f"{a:.1f}" if a == b else f"{a:.1f} to {b:.1f}" for a, b in spans[:5])
-                more = ", ..." if len(spans) > 5 else ""
+                fixes = np.flatnonzero(log.fixed)
+                when = evidence.times_of(log.t[fixes], np.isin(fixes, rows))
                 noun = "fix" if rows.size == 1 else "fixes"
-                found.append(f"{rows.size} {noun} {said}, at {listed}{more} s: not used")
+                found.append(f"{rows.size} {noun} {said}, at {when}: not used")
         return found
 
 
@@ -224,16 +223,8 @@ def _moved(log: Log, rows: NDArray[np.intp], y: Floats, step: Floats) -> NDArray
 
 def _short(flagged: NDArray[np.bool_], t: Floats) -> NDArray[np.bool_]:
     """Return flags without the runs that last too long for a jump: then the path is where these fixes say."""
-    edge = np.diff(np.concatenate(([0], flagged.astype(np.int8), [0])))
     out = flagged.copy()
-    for a, b in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True):
-        if t[b - 1] - t[a] > _LONGEST:
-            out[a:b] = False
+    for run in evidence.spans(flagged):
+        if np.ptp(t[run]) > _LONGEST:
+            out[run] = False
     return out
-
-
-def _spans(t: Floats, rows: NDArray[np.intp], fixed: NDArray[np.intp]) -> list[tuple[float, float]]:
-    """Return the first and last time of each run of neighbouring fixes."""
-    at = np.searchsorted(fixed, rows)
-    cut = np.flatnonzero(np.diff(at) > 1) + 1
-    return [(float(t[part[0]]), float(t[part[-1]])) for part in np.split(rows, cut)]

@@ -112,25 +112,31 @@ def integral(t: Floats, values: Floats, start: Floats, stop: Floats) -> Floats:
     A window that reaches beyond the samples, or over a pause of more than a second and three of
     the usual steps, gives NaN.
     """
+    return integrals(t, values, start, stop, np.zeros(1))[:, 0]
+
+
+def integrals(t: Floats, values: Floats, start: Floats, stop: Floats, late: Floats) -> Floats:
+    """Integrate a stream whose samples came so many seconds (L,) later, over windows (n,), as `integral`: (n, L)."""
+    out = np.full((start.size, late.size), np.nan)
     if t.size < 2:
-        return np.full(start.shape, np.nan)
+        return out
     step = np.diff(t)
     total = np.concatenate(([0.0], np.cumsum(step * (values[1:] + values[:-1]) / 2)))
     pause = np.concatenate(([0.0], np.cumsum(step > max(1.0, 3 * float(np.median(step))))))
-    out: Floats = _at(t, values, total, stop) - _at(t, values, total, start)
-    after = np.searchsorted(t, stop, side="left").clip(0, t.size - 1)
-    before = (np.searchsorted(t, start, side="right") - 1).clip(0, t.size - 1)
-    bad = (start < t[0]) | (stop > t[-1]) | (pause[after] != pause[before])
-    return np.where(bad, np.nan, out)
 
+    def upto(clock: Floats, k: NDArray[np.intp], when: Floats) -> Floats:  # the running integral between samples
+        k = k.clip(0, t.size - 2)
+        part = when - clock[k]
+        return np.asarray(total[k] + part * (values[k] + (values[k + 1] - values[k]) / step[k] * part / 2))
 
-def _at(t: Floats, values: Floats, total: Floats, when: Floats) -> Floats:
-    """Evaluate the running integral between samples."""
-    k = (np.searchsorted(t, when, side="right") - 1).clip(0, t.size - 2)
-    part = when - t[k]
-    slope = (values[k + 1] - values[k]) / (t[k + 1] - t[k])
-    value: Floats = total[k] + part * (values[k] + slope * part / 2)
-    return value
+    for i in range(late.size):
+        clock = t + late[i]
+        first, last = (np.searchsorted(clock, when, side="right") - 1 for when in (start, stop))
+        # a window that ends with a sample does not reach into the step after it
+        reached = np.where(clock[last] < stop, last + 1, last).clip(0, t.size - 1)
+        good = (start >= clock[0]) & (stop <= clock[-1]) & (pause[reached] == pause[first.clip(0)])
+        out[good, i] = (upto(clock, last, stop) - upto(clock, first, start))[good]
+    return out
 
 
 def _moving(log: Log, baselines: tuple[float, ...], least: float, *, swapped: bool = False) -> Windows | None:
@@ -194,7 +200,7 @@ def turning(log: Log) -> Turning:
     if t.size < 2:
         return best
     for baseline in (1.0, 2.0, 4.0):
-        start, stop, turned = _turns(log, baseline)
+        start, stop, turned = turns(log, baseline)
         expected = -integral(t, rate, start, stop)
         known = np.isfinite(expected)
         expected, turned = expected[known], turned[known]
@@ -218,7 +224,7 @@ def _line(x: Floats, y: Floats) -> tuple[float, float]:
     return sxy / sxx, sxy / float(np.sqrt(sxx * syy)) if syy > 0 else 0.0
 
 
-def _turns(log: Log, baseline: float) -> tuple[Floats, Floats, Floats]:
+def turns(log: Log, baseline: float) -> tuple[Floats, Floats, Floats]:
     """Give changes of course between successive chords, from the middle of one to that of the next."""
     found = windows(log, baseline)
     far = found.distance >= max(3.0, 2.0 * baseline)
@@ -243,6 +249,8 @@ CONVENTIONS: Mapping[str, Callable[[Floats], Floats]] = {
     "degrees counter-clockwise from east": lambda a: np.pi / 2 - np.radians(a),
     "radians counter-clockwise from north": lambda a: -a,
     "degrees counter-clockwise from north": lambda a: -np.radians(a),
+    "radians clockwise from south": lambda a: a + np.pi,
+    "degrees clockwise from south": lambda a: np.radians(a) + np.pi,
 }
 
 
@@ -318,3 +326,30 @@ def impossible_fixes(t: Floats, lat_deg: Floats, lon_deg: Floats, top_speed: flo
         else:
             out[edges[k] : edges[k + 1]] = True
     return out
+
+
+def spans(flagged: NDArray[np.bool_]) -> list[slice]:
+    """Return the runs of neighbours that are flagged."""
+    edge = np.diff(np.concatenate(([0], flagged.astype(np.int8), [0])))
+    return [slice(a, b) for a, b in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True)]
+
+
+def times_of(t: Floats, flagged: NDArray[np.bool_], off: Floats | None = None) -> str:
+    """Say when neighbours (n,) are flagged, and by up to how many metres each run is off, the first five runs."""
+    said = []
+    runs = spans(flagged)
+    for run in runs[:5]:
+        first, last = float(t[run][0]), float(t[run][-1])
+        when = f"{first:.1f}" if first == last else f"{first:.1f} to {last:.1f}"
+        most = 0.0 if off is None else float(off[run].max())
+        said.append(when if off is None else f"{when} s by up to {most:{'.0f' if most > 100 else '.2g'}} m")
+    return ", ".join(said) + (", ..." if len(runs) > 5 else "") + (" s" if off is None else "")
+
+
+def off_line(t: Floats, lat_deg: Floats, lon_deg: Floats, flagged: NDArray[np.bool_]) -> Floats:
+    """Return how far fixes (n,) are off the straight line in time between those that are not flagged, m."""
+    east, north = local_metres(lat_deg, lon_deg)
+    kept = ~flagged
+    if not kept.any():
+        return np.zeros(t.size)
+    return np.hypot(east - np.interp(t, t[kept], east[kept]), north - np.interp(t, t[kept], north[kept]))

@@ -145,32 +145,29 @@ class _Place:
 
 def _best(places: Sequence[_Place], taus: Sequence[Floats]) -> list[Fade]:
     """Return the best fade of each place among some time constants."""
-    runs: list[Grid] = []
-    for place, tau in zip(places, taus, strict=True):
-        shapes = np.exp(-place.since / tau[:, None])
-        runs += [place.drive]
-        runs += [_moved(place.drive, place.own, shape[:, None] * axis) for shape in shapes for axis in np.eye(2)]
-    each = [place.learnt for place, tau in zip(places, taus, strict=True) for _ in range(1 + 2 * tau.size)]
+    return [_best_of(place, tau) for place, tau in zip(places, taus, strict=True)]
+
+
+def _best_of(place: _Place, taus: Floats) -> Fade:
+    """Return the best fade of one place: of all places together the chains of a long drive would fill the memory."""
+    shapes = np.exp(-place.since / taus[:, None])
+    moved = [_moved(place.drive, place.own, shape[:, None] * axis) for shape in shapes for axis in np.eye(2)]
+    runs = [place.drive, *moved]
     fits = chain.solve(
         runs,
         chain.Chain(rounds=1, tail=np.inf),
-        sigma=np.reshape([fit.sigma for fit in each], (-1, len(chain.GROUPS))),
-        azimuth=[fit.z[:, chain.AZIMUTH] for fit in each],
-        weight=[fit.weight for fit in each],
+        sigma=np.broadcast_to(place.learnt.sigma, (len(runs), len(chain.GROUPS))),
+        azimuth=[place.learnt.z[:, chain.AZIMUTH]] * len(runs),
+        weight=[place.learnt.weight] * len(runs),
         learn=False,
     )
-    solved = iter(zip(runs, fits, strict=True))
-    found = []
-    for place, tau in zip(places, taus, strict=True):
-        base = place.left(*next(solved))
-        tried = []
-        for one in tau:
-            shape = np.exp(-place.since / one)
-            # what is left of a fade of one metre to the east, and to the north: D' S^-1 D
-            held = np.array([shape @ (place.left(*next(solved)) - base) for _ in range(2)])
-            tried.append(_fade(shape @ base, 0.5 * (held + held.T), float(one)))
-        found.append(max(tried, key=lambda fade: fade.gain - fade.worth))
-    return found
+    base, *left = (place.left(*solved) for solved in zip(runs, fits, strict=True))
+    tried = []
+    for k, shape in enumerate(shapes):
+        # what is left of a fade of one metre to the east, and to the north: D' S^-1 D
+        held = np.array([shape @ (off - base) for off in left[2 * k : 2 * k + 2]])
+        tried.append(_fade(shape @ base, 0.5 * (held + held.T), float(taus[k])))
+    return max(tried, key=lambda fade: fade.gain - fade.worth)
 
 
 def _fade(pull: Floats, held: Floats, tau: float) -> Fade:

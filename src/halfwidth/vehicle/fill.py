@@ -19,7 +19,7 @@ is shows in how fixes and dead reckoning disagree (`slow`): the messages name it
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from statistics import NormalDist
 from typing import Any
 
@@ -28,22 +28,27 @@ from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle import proven, widening
+from halfwidth.vehicle.adrift import adrift, moved
+from halfwidth.vehicle.adrift import words as adrift_words
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.choice import Answers, estimated
 from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, with_limits
 from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.grid import Grid, sampled
+from halfwidth.vehicle.lapses import lapses, put_right
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pieces import CONTEXT, Piece, pieces_of, spans_of, wanted_rows, with_pauses_filled
 from halfwidth.vehicle.roads import roads_of
+from halfwidth.vehicle.rows import counted
 from halfwidth.vehicle.running import FEWEST, top_speed
 from halfwidth.vehicle.sensors import Calibration
 from halfwidth.vehicle.spikes import spikes
 from halfwidth.vehicle.stamps import Stamps, restamped
 from halfwidth.vehicle.stray import strays
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
+from halfwidth.vehicle.units import azimuth_put_right
 
 Floats = NDArray[np.float64]
 
@@ -113,13 +118,13 @@ def fill(
     asked = with_limits(asked, limits, None) if held else asked
     known_roads = None if roads is None else roads_of(roads)
     beside = None if second is None else as_log(second)[0]
-    drive_log, native = as_log(log)
+    given, native = as_log(log)
     messages: list[str] = []
-    ready = prepared(drive_log, messages, None if clock_offset is None else offset, distrust=distrust, second=beside)
+    ready = prepared(given, messages, None if clock_offset is None else offset, distrust=distrust, second=beside)
     drive_log, grid, pieces, quality, t = ready.log, ready.grid, ready.pieces, ready.quality, ready.t
     if known_roads is not None:
         asked = with_limits(asked, limits, known_roads.local(grid.frame))
-    chosen = _chosen(grid, asked, messages)
+    chosen = _chosen(drive_log, grid, asked, messages)
     spans = spans_of(drive_log, grid, chosen, t, quality)
     free = asked is None or asked.name != chosen.name
     answers = estimated(pieces, chosen, spans, level, messages, free=free)
@@ -149,7 +154,7 @@ def fill(
         since_fix_s=since_fix_of(written, quality),
         level=level,
         method=chosen.name,
-        log=replace(drive_log, t=ready.stamps.back(drive_log.t)),
+        log=given,
         gaps=gaps,
         # where nothing could be tested, a model's own variance is a size and no probability
         guarantee="credible" if all(bridge.tested for bridge in answers.bridges) else "none",
@@ -213,6 +218,16 @@ def prepared(
         leaps = spikes(log)
         messages.extend(leaps.words(log))
         log = leaps.masked(log)
+    far = adrift(log) if offset is None else None
+    if far is not None:
+        messages.append(adrift_words(far))
+        log = moved(log, far)
+    if distrust:
+        lapsed = lapses(log)
+        messages.extend(lapse.words(log) for lapse in lapsed)
+        log = put_right(log, lapsed)
+        log, said = azimuth_put_right(log)
+        messages.extend([f"{said}: put right"] if said else [])
         # stray fixes show best against speed and yaw rate, later
         sensed = all(np.isfinite(getattr(log, name)).any() for name in ("speed_mps", "yaw_rate_radps"))
         doubtful = distrusted(log, jumps=not sensed)
@@ -294,7 +309,7 @@ def as_log(given: Any) -> tuple[Log, str]:
     return from_frame(given), library if library in ("pandas", "polars", "pyarrow") else "pandas"
 
 
-def _chosen(grid: Grid, asked: Method | None, messages: list[str]) -> Method:
+def _chosen(log: Log, grid: Grid, asked: Method | None, messages: list[str]) -> Method:
     """Choose the best method that the sensors allow, and say why it is not the usual one."""
     lacks = None if asked is None else asked.lacks(grid)
     if asked is not None and lacks is None:
@@ -303,7 +318,9 @@ def _chosen(grid: Grid, asked: Method | None, messages: list[str]) -> Method:
         messages.append(f"`{asked.name}` needs the {lacks}, which the log does not have")
     n = int(grid.seen.sum())
     if n < FEWEST:
-        messages.append(f"the log has only {n} fix{'es' if n > 1 else ''}: straight lines between them")
+        given = int(log.fixed.sum())
+        few = f"the log has only {counted(given, 'fix')}" + (f", {n} of them of use" if given > n else "")
+        messages.append(f"{few}: straight lines between them")
         return METHODS["linear"]
     if not grid.has_speed and not grid.has_yaw_rate:
         messages.append("the log has neither speed nor yaw rate: gaps are filled by constant velocity")

@@ -290,7 +290,7 @@ def bridged(clock: Floats, yaw_rate: Floats) -> tuple[Floats, Floats]:
         return clock, yaw_rate
     lasts = _LASTS["yaw_rate"]
     step = np.diff(clock)
-    long = np.flatnonzero(step > _silent_from(step))
+    long = np.flatnonzero(step > silent_from(step))
     away = np.arange(_EVERY, 6.0 * lasts, _EVERY)
     left = np.exp(-away / lasts) * (away < away[-1])
     times = [clock[0] - away[::-1], clock, clock[-1] + away]
@@ -315,12 +315,12 @@ def _bridge(since: Floats, length: Floats, first: Floats | float, last: Floats |
     return np.asarray(first * share(length - since) + last * share(since))
 
 
-def _silent_from(step: Floats) -> float:
+def silent_from(step: Floats) -> float:
     """Return how long a step between two samples must be to be a silence, s."""
     return max(3.0 * float(np.median(step)), 0.5)
 
 
-def silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
+def silence(t: Floats, clock: Floats, rate: float, most: float, limit: float | None = None) -> Floats:
     """Return the standard deviation of each step's mean where the sensor was silent for long, 0 elsewhere.
 
     The steps of one silence err together, while an estimator takes them as independent. So each is given the share of
@@ -334,6 +334,8 @@ def silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
         Times of the samples, s.
     rate, most : float
         How fast the quantity changes while the sensor is silent, a second, and by how much at most.
+    limit : float, optional
+        How long a step between two samples must be to be a silence, s; `silent_from` the samples if absent.
 
     Returns
     -------
@@ -341,8 +343,7 @@ def silence(t: Floats, clock: Floats, rate: float, most: float) -> Floats:
     """
     if clock.size < 2 or t.size < 2:
         return np.zeros(t.size)
-    step = np.diff(clock)
-    limit = _silent_from(step)
+    limit = silent_from(np.diff(clock)) if limit is None else limit
     middle = t.copy()
     middle[1:] -= np.diff(t) / 2
     k = np.searchsorted(clock, middle)

@@ -67,7 +67,9 @@ def span(seconds: float) -> str:
 
 def way(metres: float) -> str:
     """Write a distance."""
-    return f"{metres:,.0f}\u00a0m" if metres < 2000 else f"{metres / 1000:,.1f}\u00a0km"
+    if metres >= 2000:
+        return f"{metres / 1000:,.1f}\u00a0km"
+    return f"{metres:,.{1 if 0 < metres < 10 else 0}f}\u00a0m"
 
 
 def length(metres: float) -> str:

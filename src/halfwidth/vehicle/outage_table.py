@@ -289,6 +289,9 @@ class Outages:
     def plot(self, ax: Any = None, *, tolerance: float = TOLERANCE) -> Any:
         """Plot error against the length of the outage: the mean, thin lines the mean of the largest.
 
+        With one length there is a row for each method instead: a dot at the mean, a line to the mean of the largest.
+        The nearest method comes first.
+
         Parameters
         ----------
         ax : matplotlib Axes, optional
@@ -306,20 +309,47 @@ class Outages:
         """
         try:
             import matplotlib.pyplot as plt
+            from matplotlib.ticker import LogLocator, NullFormatter
         except ImportError as exc:
             raise Missing("`plot` needs matplotlib", hint="pip install 'halfwidth[plot]'") from exc
-        ax = plt.figure(figsize=(7, 4.5), layout="constrained").add_subplot() if ax is None else ax
-        for m in self.methods:
-            cells = sorted((c for c in self.cells if c.method == m), key=lambda c: c.length)
-            t = [c.length for c in cells]
-            (line,) = ax.loglog(t, [max(c.mean, 1e-4) for c in cells], marker="o", markersize=3, label=m)
-            ax.loglog(t, [max(c.max, 1e-4) for c in cells], color=line.get_color(), linewidth=0.6, linestyle="--")
-        ax.axhline(tolerance, color="black", linewidth=0.8, label=f"tolerance {tolerance:g} m")
-        ax.set_xticks(self.lengths, [f"{length:g}" for length in self.lengths])
-        ax.minorticks_off()
-        ax.set_xlabel("length of the outage, s")
-        ax.set_ylabel("error, m: mean, dashed largest")
-        ax.legend(fontsize="small")
+        one = len(self.lengths) == 1
+        size = (8, 1.6 + 0.24 * len(self.methods)) if one else (8, 5)
+        ax = plt.figure(figsize=size, layout="constrained").add_subplot() if ax is None else ax
+        cells = {m: sorted((c for c in self.cells if c.method == m), key=lambda c: c.length) for m in self.methods}
+        order = sorted(self.methods, key=lambda m: cells[m][-1].mean if cells[m] else np.inf)
+        map_, shades = ("tab20", 20) if len(order) > 10 else ("tab10", 10)
+        colours = [plt.get_cmap(map_)(k) for k in range(shades)]
+        for k, m in enumerate(order):
+            mean, largest = ([max(getattr(c, what), 1e-4) for c in cells[m]] for what in ("mean", "max"))
+            style = {"color": colours[k % len(colours)], "marker": "osD^v"[k // len(colours) % 5], "label": m}
+            if one:
+                ax.plot([*mean, *largest], [k] * 2 * len(mean), linewidth=2, markersize=6, markevery=[0], **style)
+                ax.plot(largest, [k] * len(largest), color=style["color"], marker="|", markersize=9)
+            else:
+                t = [c.length for c in cells[m]]
+                ax.plot(t, mean, markersize=3, **style)
+                ax.plot(t, largest, color=style["color"], linewidth=0.6, linestyle="--")
+        words, said = f"tolerance {tolerance:g} m", "error, m: mean, {} mean of the largest"
+        error = ax.xaxis if one else ax.yaxis
+        if one:
+            ax.set_xscale("log")
+            ax.axvline(tolerance, color="black", linewidth=0.8, label=words)
+            ax.set_yticks(range(len(order)), order)
+            ax.set_ylim(len(order) - 0.5, -0.5)
+            ax.set_title(f"outages of {self.lengths[0]:g} s", fontsize="medium")
+            ax.set_xlabel(f"{said.format('line to the')}; {words}")
+        else:
+            ax.loglog()
+            ax.axhline(tolerance, color="black", linewidth=0.8, label=words)
+            ax.set_xticks(self.lengths, [f"{length:g}" for length in self.lengths])
+            ax.xaxis.minorticks_off()
+            ax.set_xlabel("length of the outage, s")
+            ax.set_ylabel(said.format("dashed the"))
+            ax.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        error.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        error.set_major_formatter("{x:g}")
+        error.set_minor_formatter(NullFormatter())
+        ax.grid(axis="x" if one else "both", linewidth=0.4, alpha=0.6)
         return ax
 
     def to_dict(self) -> dict[str, Any]:

@@ -9,6 +9,10 @@ from halfwidth.vehicle.grid import Grid
 
 Floats = NDArray[np.float64]
 
+#: What points somewhere counts by how near it is, as a Gaussian of this deviation, s, and so many of them off no more;
+#: so many knots are looked at together.
+_SPREAD, _REACH, _ABREAST = 15.0, 9.0, 32
+
 
 def azimuth_of(drive: Grid) -> Floats:
     """Return a first azimuth: the integrated yaw rate, turned to where fixes and courses point.
@@ -47,11 +51,29 @@ def azimuth_of(drive: Grid) -> Floats:
     if when.size == 0 or not np.any(pointing):
         return turned
     knots = np.linspace(t[0], t[-1], max(2, min(400, int((t[-1] - t[0]) / 5.0) + 2)))
-    near2 = ((knots[:, None] - when) / 15.0) ** 2
-    # far from all data the nearest one decides: the exponent is taken relative to the best of each knot
-    turn = np.exp(-0.5 * (near2 - near2.min(axis=1, keepdims=True))) @ pointing
+    turn = _smooth(knots, when, pointing)
     first: Floats = turned + np.interp(t, knots, np.unwrap(np.angle(turn)))
     return first
+
+
+def _smooth(knots: Floats, when: Floats, pointing: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return means of what is known at some times, weighted by how near they are to each knot, both ascending.
+
+    Far from all data the nearest one decides: the weights are relative to the largest one of each knot.
+    """
+    order = np.argsort(when, kind="stable")
+    when, pointing = when[order], pointing[order]
+    after = np.clip(np.searchsorted(when, knots), 1, when.size)
+    nearest = np.minimum(np.abs(knots - when[after - 1]), np.abs(knots - when[np.minimum(after, when.size - 1)]))
+    # what is further off than this counts for nothing: a few knots at a time look at what is around them
+    reach = np.hypot(nearest, _REACH * _SPREAD)
+    turn = np.zeros(knots.size, dtype=np.complex128)
+    for k in range(0, knots.size, _ABREAST):
+        own = slice(k, k + _ABREAST)
+        lo, hi = np.searchsorted(when, [(knots - reach)[own].min(), (knots + reach)[own].max()])
+        near2 = (knots[own, None] - when[lo:hi]) ** 2 - nearest[own, None] ** 2
+        turn[own] = np.exp(-0.5 / _SPREAD**2 * near2) @ pointing[lo:hi]
+    return turn
 
 
 def _secants(drive: Grid) -> tuple[Floats, Floats, NDArray[np.complex128]]:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth import _core
-from halfwidth.vehicle.grid import DRIFT, Grid, bridged, means, silence
+from halfwidth.vehicle.grid import DRIFT, Grid, bridged, means, silence, silent_from
 from halfwidth.vehicle.pointing import azimuth_of
 
 Floats = NDArray[np.float64]
@@ -147,11 +147,12 @@ def solve(
     y = np.column_stack((grid.east, grid.north, np.zeros(T)))
     y[:, :2] -= origin
     y[~grid.seen, :2] = 0.0
+    heard = {name: _Heard.of(*streams[name], name, grid) for name in ("speed", "yaw_rate")}
     found: tuple[Floats, Floats, Floats] | None = None
     sigma, loglik = np.sqrt(s2), -np.inf
     n = 11 if antenna else 9  # states; the core has these two sizes compiled
     for k in range(rounds):
-        steps = _steps(grid, streams, clock, still)
+        steps = _steps(grid, heard, clock, still)
         if azimuth is None:
             azimuth = azimuth_of(replace(grid, speed=steps.v, yaw_rate=steps.w))
         A, b, Q, S, C = _motion(grid, steps, azimuth, s2, s2[3] * grid.h / slow_weight, still, n)
@@ -206,15 +207,37 @@ class _Steps:
     gyro_variance: float  # of the mean yaw rate while standing
 
 
-def _steps(grid: Grid, streams: Streams, clock: Floats, still: NDArray[np.bool_]) -> _Steps:
+@dataclass(frozen=True, eq=False)
+class _Heard:
+    """What a sensor said about a piece, wherever its clock may be, with one more sample on either side."""
+
+    t: Floats
+    values: Floats
+    clock: Floats  # times of the samples without those that bridge silences
+    limit: float  # from how long a step on it is a silence, s
+
+    @classmethod
+    def of(cls, clock: Floats, values: Floats, name: str, grid: Grid) -> "_Heard":
+        limit = silent_from(np.diff(clock)) if clock.size > 1 else np.inf
+        t, values = (clock, values) if name == "speed" else bridged(clock, values)
+        room = _FARTHEST + _APART
+        near, own = (_around(times, float(grid.t[0]) - room, float(grid.t[-1]) + room) for times in (t, clock))
+        return cls(t[near], values[near], clock[own], limit)
+
+
+def _around(t: Floats, first: float, last: float) -> slice:
+    """Return the samples from one before a time to one after another."""
+    return slice(max(int(np.searchsorted(t, first)) - 1, 0), int(np.searchsorted(t, last, side="right")) + 1)
+
+
+def _steps(grid: Grid, heard: Mapping[str, _Heard], clock: Floats, still: NDArray[np.bool_]) -> _Steps:
     h = grid.h
 
     def mean(name: str, offset: float) -> Floats:
-        t, values = streams[name] if name == "speed" else bridged(*streams[name])
-        return means(grid.t, t + offset, values)
+        return means(grid.t, heard[name].t + offset, heard[name].values)
 
     def lost(name: str, offset: float) -> Floats:
-        return h * silence(grid.t, streams[name][0] + offset, *DRIFT[name])
+        return h * silence(grid.t, heard[name].clock + offset, *DRIFT[name], heard[name].limit)
 
     def shift(name: str, offset: float) -> Floats:
         return h * (mean(name, offset + _APART) - mean(name, offset - _APART)) / (2 * _APART)

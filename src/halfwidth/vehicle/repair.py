@@ -18,7 +18,7 @@ from halfwidth.vehicle.formats.layout import FACTORS, KIND, ROLES, SEMICIRCLE, U
 from halfwidth.vehicle.formats.raw import Raw
 from halfwidth.vehicle.log import STREAMS, Log
 from halfwidth.vehicle.rows import Rows, counted
-from halfwidth.vehicle.units import contradicted_convention, contradicted_yaw, matched_factor, misfit, swapped_columns
+from halfwidth.vehicle.units import azimuth_put_right, contradicted_yaw, matched_factor, misfit, swapped_columns
 
 Floats = NDArray[np.float64]
 
@@ -76,6 +76,7 @@ def to_log(raw: Raw, *, repair: bool = True) -> Log:
     _positions(raw, streams, notes)
     rows = Rows(raw.source, t, streams, notes)
     rows.drop_untimed()
+    rows.unwrap()
     rows.drop_before_clock_was_set()
     rows.sort()
     rows.spread_coarse_stamps()
@@ -352,11 +353,10 @@ def _contradicted(log: Log, raw: Raw, notes: list[str]) -> Log:
         log = replace(log, speed_mps=log.speed_mps * row[2])
         notes.append(f"{row[1]}, as distances between fixes say (ratio {row[0]:.3g}): put right")
     log = _unswapped(log, notes)
-    convention = contradicted_convention(log)
-    if convention is not None and not _asked(raw, "azimuth"):
-        turned = evidence.CONVENTIONS[convention](log.azimuth_rad)
-        log = replace(log, azimuth_rad=turned % (2 * np.pi))
-        notes.append(f"azimuth is in {convention}, as courses between fixes say: put right")
+    if not _asked(raw, "azimuth"):
+        log, said = azimuth_put_right(log)
+        if said:
+            notes.append(f"{said}: put right")
     factor = contradicted_yaw(evidence.turning(log))
     if factor is not None and not _asked(raw, "yaw_rate"):
         log = replace(log, yaw_rate_radps=log.yaw_rate_radps * factor)
@@ -428,7 +428,7 @@ def _held_fixes(log: Log, notes: list[str]) -> Log:
         return log
     gone = np.zeros(len(log), dtype=bool)
     gone[rows[blank]] = True
-    why = "repeated by the logger" if held else "frozen while the car moved"
+    why = "repeated by the logger" if held else f"frozen while the car moved, at {evidence.times_of(t, blank)}"
     notes.append(f"{counted(int(blank.sum()), 'fix')} {why}: dropped")
     changed: dict[str, Any] = {
         name: np.where(gone, np.nan, getattr(log, name)) for name in ("lat_deg", "lon_deg", "alt_m", "azimuth_rad")
@@ -443,12 +443,14 @@ def _impossible(log: Log, notes: list[str]) -> Log:
     bad = evidence.impossible_fixes(t, lat, lon, TOP_SPEED, FIX_SLACK)
     if not bad.any():
         return log
+    off = evidence.off_line(t, lat, lon, bad)
+    when = evidence.times_of(t, bad, off)
     if bad.mean() > 0.2:
-        notes.append(f"{int(bad.sum())} of {bad.size} fixes lie where no car gets in the time: kept, look at `check`")
+        notes.append(f"{int(bad.sum())} of {bad.size} fixes lie where no car gets in the time, at {when}: kept")
         return log
     gone = np.zeros(len(log), dtype=bool)
     gone[rows[bad]] = True
-    notes.append(f"{counted(int(bad.sum()), 'fix')} dropped that no car could reach (the first at {t[bad][0]:.6g} s)")
+    notes.append(f"{counted(int(bad.sum()), 'fix')} dropped that no car could reach, at {when}")
     changed: dict[str, Any] = {
         name: np.where(gone, np.nan, getattr(log, name)) for name in ("lat_deg", "lon_deg", "alt_m", "azimuth_rad")
     }

@@ -1,7 +1,7 @@
 """The tables of a track's page: its gaps, the outages made in its own log, the settings."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ def gap_cells(track: Track, gap: Gap, number: int) -> list[str]:
         markup.moment(track, gap.start),
         markup.moment(track, gap.stop),
         f"{gap.duration_s:.1f}",
-        f"{gap.distance_m:,.0f}",
+        f"{gap.distance_m:,.{0 if gap.distance_m >= 10 else 1}f}",
         markup.metres(gap.max_half_m),
         markup.text(gap.quality),
     ]
@@ -102,13 +102,29 @@ def _own_table(track: Track, rows: Sequence[Mapping[str, Any]]) -> str:
         ]
         for row in rows
     ]
-    inside = f"inside the {100 * track.level:g} % interval"
+    head = ["hidden for, s", "stretches", "mean error, m", "largest error, m"]
+    head += [f"inside the {100 * track.level:g} % interval", "then widened"]
+    kinds = [_kind(track, row) for row in rows]
+    several = set(kinds) != {"between fixes"}
+    if several:
+        head.insert(1, "where")
+        for line, kind in zip(body, kinds, strict=True):
+            line.insert(1, markup.text(kind))
     return markup.table(
-        ["hidden for, s", "stretches", "mean error, m", "largest error, m", inside, "then widened"],
+        head,
         body,
+        words=[1] if several else [],
         caption="Mean error, and the mean over the stretches of the largest error in each. Half-widths in gaps are"
         " widened or narrowed until the promised share of hidden fixes lies inside, all lengths read together.",
     )
+
+
+def _kind(track: Track, row: Mapping[str, Any]) -> str:
+    """Say what kind of stretch was hidden, and how it was filled if not by the track's method."""
+    where = "beyond the fixes" if row.get("side") == "one" else "between fixes"
+    silent = " and ".join(str(name).replace("_", " ") for name in row.get("silent") or ())
+    by = row.get("by") or track.method
+    return where + (f" without {silent}" if silent else "") + (f", by {by}" if by != track.method else "")
 
 
 def _widened(inflation: float) -> str:
@@ -199,14 +215,24 @@ def _cell(value: object) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key}: {_cell(item)}" for key, item in value.items())
     if isinstance(value, list | tuple | np.ndarray):
-        return ", ".join(_cell(item) for item in value)
+        pairs = any(isinstance(item, list | tuple) for item in value)
+        return ("; " if pairs else ", ").join(_cell(item) for item in value) or "–"
     return str(value)
+
+
+def _rows(name: str, value: object) -> Iterator[list[str]]:
+    """Write a setting as rows of a table: one, or one for each entry of what it holds."""
+    if isinstance(value, Mapping) and value:
+        for key, item in value.items():
+            yield from _rows(f"{name}, {key}", item)
+    else:
+        yield [markup.text(name.replace("_", " ")), markup.text(_cell(value))]
 
 
 def settings_section(track: Track, command: str | None) -> str:
     """List the settings and give the command that makes the page again."""
     settings = {"method": track.method, "level": track.level, **track.settings}
-    body = [[markup.text(name.replace("_", " ")), markup.text(_cell(value))] for name, value in settings.items()]
+    body = [row for name, value in settings.items() for row in _rows(name, value)]
     again = command if command is not None else _command(track)
     # an option is not to be broken at its hyphens
     parts = [
@@ -216,7 +242,8 @@ def settings_section(track: Track, command: str | None) -> str:
     return (
         "<section>\n<h2>Make it again</h2>\n"
         f"<pre><code>{' '.join(parts)}</code></pre>\n"
-        f"{markup.table(['setting', 'value'], body, words=[0, 1])}</section>\n"
+        f"<details><summary>{markup.count(len(body), 'setting')}</summary>"
+        f"{markup.table(['setting', 'value'], body, words=[0, 1])}</details></section>\n"
     )
 
 

@@ -56,7 +56,7 @@ class Rough:
         middle, took = 0.5 * (chord.start + chord.stop), chord.stop - chord.start
         t, v = plain.stream(log, "speed")
         if t.size > 2 and middle.size:
-            found = np.stack([np.abs(evidence.integral(t + lag, v, chord.start, chord.stop)) / took for lag in lags], 1)
+            found = np.abs(evidence.integrals(t, v, chord.start, chord.stop, lags)) / took[:, None]
             when["speed"] = middle
             pace = chord.distance / took
             usable = np.isfinite(found).all(axis=1) & (pace > 1.0)
@@ -75,7 +75,7 @@ class Rough:
             there[there] &= at[later[there]] - at[there] < 8.0
             a, b = at[there], at[later[there]]
             turned = wrapped(course[later[there]] - course[there])
-            found = np.stack([-evidence.integral(t + lag, w, a, b) for lag in lags], 1)
+            found = -evidence.integrals(t, w, a, b, lags)
             when["yaw_rate"] = 0.5 * (a + b)
             misfit["yaw_rate"] = np.abs(wrapped(found - turned[:, None]))
         return cls(lags, when, misfit, spans)

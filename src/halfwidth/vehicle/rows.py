@@ -22,6 +22,12 @@ _CLOCK_SET = 86_400.0
 #: A clock that goes back further than this has been set, not jittered (s).
 _JITTER = 5.0
 
+#: Clocks that begin anew: after so many seconds, and what begins.
+_ROUND = ((86_400.0, "day"), (604_800.0, "week"), (2**32 * 1e-3, "count of ms"), (2**32 * 1e-6, "count of us"))
+
+#: Seconds from its end, and from its beginning, that a clock that begins anew is seen in.
+_TURN = 60.0
+
 #: Rows are shuffled if so many go back in time, and if so many come at the usual rate once they are sorted.
 _DISORDER, _REGULAR = 0.3, 0.8
 
@@ -120,6 +126,23 @@ class Rows:
         if self.t.size == 0:
             raise BadLog(f"`{self.source}` has no row with a time")
 
+    def unwrap(self) -> None:
+        """Count on where a clock that counts a day, a week or 32 bits begins anew."""
+        if self.t.size < 2 or self.t.min() < 0:
+            return
+        step, highest = np.diff(self.t), float(self.t.max())
+        for period, name in _ROUND:
+            turns = np.flatnonzero(np.abs(step) > period / 2)
+            ends = np.sort(np.column_stack((self.t[turns], self.t[turns + 1])), axis=1)
+            if not turns.size or highest > period or ends[:, 0].max() > _TURN or ends[:, 1].min() < period - _TURN:
+                continue
+            count = np.zeros(self.t.size)
+            count[turns + 1] = -np.sign(step[turns])
+            self.t = self.t + period * np.cumsum(count)
+            some = counted(max(int(count.sum()), 1), "time")
+            self.notes.append(f"the time begins anew with each {name}, {some} in the log: counted on")
+            return
+
     def drop_before_clock_was_set(self) -> None:
         """Keep the main block where the clock was set while the log ran."""
         cuts = np.flatnonzero(np.abs(np.diff(self.t)) > _CLOCK_SET) + 1
@@ -153,6 +176,9 @@ class Rows:
             self.notes.append("rows ran backwards in time: turned around")
             return
         restarts = np.flatnonzero(step < -_JITTER) + 1
+        if restarts.size and self._drop_copies():
+            self.sort()
+            return
         if restarts.size and self._shuffled(back):
             self._keep(np.argsort(self.t, kind="stable"))
             self.notes.append("rows stood in no order of time: sorted")
@@ -162,6 +188,22 @@ class Rows:
         order = np.argsort(self.t, kind="stable")
         self._keep(order)
         self.notes.append(f"time went backwards {counted(int(back.sum()), 'time')}: rows sorted")
+
+    def _drop_copies(self) -> bool:
+        """Drop rows that stand elsewhere again, value for value; return whether there were any."""
+        order = np.argsort(self.t, kind="stable")
+        same = np.diff(self.t[order]) == 0
+        for values in self.streams.values():
+            a, b = values[order[:-1]], values[order[1:]]
+            same &= (a == b) | (np.isnan(a) & np.isnan(b))
+        copies = order[1:][same]
+        if not copies.size:
+            return False
+        kept = np.ones(self.t.size, dtype=bool)
+        kept[copies] = False
+        self._keep(kept)
+        self.notes.append(f"{counted(copies.size, 'row')} dropped, each there twice")
+        return True
 
     def _shuffled(self, back: NDArray[np.bool_]) -> bool:
         """Whether rows of one drive stand in no order: no two share a time, and once sorted they come regularly."""

@@ -24,7 +24,7 @@ from halfwidth.vehicle.log import Log
 Floats = NDArray[np.float64]
 
 #: What a sample may differ by at once and by how much more for each second, the stream's name and its unit.
-_LIMIT = {"speed_mps": (1.0, 12.0, "speed", "m/s"), "yaw_rate_radps": (0.4, 3.0, "yaw rate", "rad/s")}
+LIMIT = {"speed_mps": (1.0, 12.0, "speed", "m/s"), "yaw_rate_radps": (0.4, 3.0, "yaw rate", "rad/s")}
 
 _NONE = np.empty(0, dtype=np.intp)
 
@@ -46,7 +46,7 @@ _OFTEN, _LONGER, _MORE, _CHANGES = 3.0, 3.0, 1.5, 50
 _FEW, _CHANCE, _LARGE = 3, 0.01, 0.95
 
 #: Below this a sensor may say 0: so much of a leap to or from 0 proves nothing.
-_BLIND = {"speed_mps": 2.0, "yaw_rate_radps": np.inf}
+BLIND = {"speed_mps": 2.0, "yaw_rate_radps": np.inf}
 
 #: No car turns like this for a twentieth of the time, rad/s: the stream is in degrees.
 _IN_DEGREES = 2.0
@@ -68,7 +68,7 @@ class Spikes:
     stuck: Mapping[str, list[NDArray[np.intp]]]
 
     def __len__(self) -> int:
-        return sum(self._gone(name).size for name in _LIMIT)
+        return sum(self._gone(name).size for name in LIMIT)
 
     def _gone(self, name: str) -> NDArray[np.intp]:
         return np.concatenate([self.rows.get(name, _NONE), *self.stuck.get(name, [])])
@@ -85,7 +85,7 @@ class Spikes:
     def words(self, log: Log) -> list[str]:
         """Say what was found, with times and sizes."""
         found = []
-        for name, (_, _, label, unit) in _LIMIT.items():
+        for name, (_, _, label, unit) in LIMIT.items():
             values, rows, stuck = getattr(log, name), self.rows.get(name, _NONE), self.stuck.get(name, [])
             if rows.size:
                 listed = ", ".join(f"{log.t[k]:.1f} s ({values[k]:.3g} {unit})" for k in rows[:5].tolist())
@@ -113,7 +113,7 @@ def spikes(log: Log) -> Spikes:
     """
     found: dict[str, NDArray[np.intp]] = {}
     stuck: dict[str, list[NDArray[np.intp]]] = {}
-    for name, (at_once, rate, _, _) in _LIMIT.items():
+    for name, (at_once, rate, _, _) in LIMIT.items():
         rows = np.flatnonzero(np.isfinite(getattr(log, name)))
         if rows.size < 2 * _WINDOW:
             continue
@@ -129,7 +129,7 @@ def spikes(log: Log) -> Spikes:
         if 0 < spike.sum() <= max(1.0, _MANY * rows.size):
             found[name] = rows[spike]
             rows, t, values = rows[~spike], t[~spike], values[~spike]
-        begin, end = _stuck(t, values, at_once + rate * float(np.median(np.diff(t))), _BLIND[name])
+        begin, end = _stuck(t, values, at_once + rate * float(np.median(np.diff(t))), BLIND[name])
         runs = [rows[a : b + 1] for a, b in zip(begin, end, strict=True)]
         if runs and sum(run.size for run in runs) <= _MANY_STUCK * rows.size:
             stuck[name] = runs

@@ -115,7 +115,7 @@ class Track:
     method : str
         Name of the estimator that filled the gaps.
     log : Log
-        The log that was filled.
+        The log that was filled, as it was given: with what the messages say was left out or put right.
     gaps : tuple of Gap
         The stretches that were filled; see `gaps_of`.
     guarantee : {"proven", "credible", "none"}
@@ -356,7 +356,7 @@ class Track:
             shown = sorted(self.gaps, key=lambda gap: -gap.max_half_m)[: 7 - (self.proven is not None)]
             lines += [
                 f"  {gap.quality:<12}{gap.start:>7.1f}{gap.stop:>10.1f}{gap.duration_s:>11.1f}"
-                f"{gap.distance_m:>12.0f}{gap.max_half_m:>14.2f}"
+                f"{gap.distance_m:>12.{0 if gap.distance_m >= 10 else 1}f}{gap.max_half_m:>14.2f}"
                 for gap in sorted(shown, key=lambda gap: gap.start)
             ]
             if len(self.gaps) > len(shown):

@@ -1,5 +1,7 @@
 """What the fixes say of units and signs: which mistake makes a stream contradict them."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from halfwidth.vehicle import evidence
@@ -59,6 +61,15 @@ def contradicted_convention(log: Log) -> str | None:
     # a straight drive cannot tell a mirrored azimuth from a right one
     close = [name for name in errors if errors[name].n and errors[name].value < errors[best].value + 0.1]
     return best if len(close) == 1 else None
+
+
+def azimuth_put_right(log: Log) -> tuple[Log, str]:
+    """Return a log whose azimuth is in our convention and what it was in, "" if nothing contradicts it."""
+    convention = contradicted_convention(log)
+    if convention is None:
+        return log, ""
+    turned = evidence.CONVENTIONS[convention](log.azimuth_rad)
+    return replace(log, azimuth_rad=turned % (2 * np.pi)), f"azimuth is in {convention}, as courses between fixes say"
 
 
 def swapped_columns(log: Log) -> bool:

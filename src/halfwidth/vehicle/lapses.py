@@ -1,0 +1,496 @@
+"""Stretches in which speed or yaw rate contradict the fixes by a factor: fallen silent at 0, in another unit or sign.
+
+A channel that drops to 0 while the car drives, a logger that is set from km/h to m/s half-way, a gyro that is mounted
+again upside down: such a stream is right for a part of the drive only, and no factor for the whole of it puts it right.
+So the drive is cut into windows of a second or two, and for each window and each thing that a stream may be (as most of
+it is, in another unit, turned round, silent) it is asked how badly that fits what the fixes show. The most probable
+course of such states over the drive is that of a chain that seldom changes (Viterbi). It changes easily where the
+stream leaps further than a car can, and only for much evidence where it does not: fixes that come back wrong after a
+tunnel, or fade, contradict the speed for some seconds, too, but by no constant factor, and the speed does not leap.
+
+What is in another unit or sign is put right, what is silent or wrong by a factor that is no unit's is not used.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halfwidth.vehicle import evidence
+from halfwidth.vehicle.log import Log
+from halfwidth.vehicle.spikes import BLIND, LIMIT
+from halfwidth.vehicle.units import FACTOR_NEAR, contradicted_yaw, matched_factor
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: What a stream may read of the truth: factors of units and signs; 0 is silent, NaN any other constant factor.
+_FACTORS = {
+    "speed_mps": (1.0, 3.6, 1 / 0.44704, 3600 / 1852, 1 / 3.6, 0.44704, 0.0, np.nan),
+    "yaw_rate_radps": (1.0, -1.0, 180 / np.pi, -180 / np.pi, np.pi / 180, -np.pi / 180, 0.0),
+}
+
+_NAMES = {"speed_mps": "speed", "yaw_rate_radps": "yaw rate"}
+
+#: What units are called by their factor.
+_UNITS = {3.6: "km/h", 1 / 0.44704: "mph", 3600 / 1852: "knots", 180 / np.pi: "deg/s"}
+
+#: Length of a window, s, by stream; windows that are needed, and that a stretch must have in which it is contradicted.
+_SPAN = {"speed_mps": 1.0, "yaw_rate_radps": 2.0}
+_FEWEST, _STRETCH = 20, 4
+
+#: How far either way the clock is looked for, and how far it may be off that, s.
+_LAGS, _LAG = 5.0, 0.25
+_SLACK = {"speed_mps": 1.0, "yaw_rate_radps": 0.5}
+
+#: What speed and turning of fixes are uncertain by besides their noise: so much, m/s and rad, and this share.
+_SIZE = {"speed_mps": (0.3, 0.12), "yaw_rate_radps": (0.06, 0.15)}
+
+#: A window costs so much at most, and if any factor is allowed; a change of state where the stream leaps and elsewhere.
+_MOST, _ANY, _LEAP, _CHANGE = 6.0, 3.0, 6.0, 25.0
+
+#: A factor that is no unit's is constant to this share, and off by this (logarithms); slower than this a car hardly
+#: moves, m/s.
+_CONSTANT, _OFF, _SLOW = 0.12, 0.25, 3.0
+
+#: A leap is so many times what all but a hundredth of the changes are; so many changes say what is usual.
+_OFTEN, _CHANGES = 3.0, 50
+
+#: A turn is so much, rad, and so many times as large as it is uncertain; a yaw rate that contradicts such a share of
+#: them is none of this car.
+_TURN, _TURN_SIZES, _AGAINST = 0.25, 2.5, 0.6
+
+#: A speed that leaps away comes back within so many seconds; nobody drives backwards this fast, m/s.
+_AWAY, _FORWARD = 30.0, 6.0
+
+#: Two states fit a window alike if they cost so little more.
+_ALIKE = 0.5
+
+#: Windows at most, so that a long drive takes no longer.
+_WINDOWS = 20_000
+
+
+@dataclass(frozen=True)
+class Lapse:
+    """A stretch of a stream that is not as the rest.
+
+    Parameters
+    ----------
+    name : str
+        Field of the log.
+    first, last : int
+        Its first and last row.
+    reads : float
+        What it reads of the truth in the stretch; 0 if it is silent, NaN if it has nothing to do with it.
+    rest : float
+        What it reads elsewhere.
+    says : float
+        What it says there at first.
+    pace : float
+        Median of what the fixes show there: speed, m/s, or yaw rate, rad/s.
+    right : bool
+        Whether it is put right; otherwise it is not used.
+    """
+
+    name: str
+    first: int
+    last: int
+    reads: float
+    rest: float
+    says: float
+    pace: float
+    right: bool
+
+    @property
+    def factor(self) -> float:
+        """What makes the stretch like the rest."""
+        return self.rest / self.reads if self.right else float("nan")
+
+    def words(self, log: Log) -> str:
+        """Say what it is, with times."""
+        label, t = _NAMES[self.name], log.t
+        when = f"from {t[self.first]:.1f} s on" if self.last == len(log) - 1 else f"{t[self.last]:.1f} s"
+        when = when if self.last == len(log) - 1 else f"from {t[self.first]:.1f} to {when}"
+        if np.isnan(self.reads):
+            return f"the {label} does not follow the turns that the fixes show: not used"
+        if not self.reads:
+            moves = f"the car goes {self.pace:.0f} m/s" if self.name == "speed_mps" else "the fixes turn"
+            return f"the {label} says {self.says:.3g} {when} while {moves}: not used"
+        ratio = self.reads / self.rest
+        if self.name == "speed_mps" and ratio < 0:
+            return "the speed is negative all along, and no car drives backwards like that: taken as positive"
+        what = "what the fixes say" if self.rest == 1 else "what it reads elsewhere, as the fixes show,"
+        units = [f"in {name}" for size, name in _UNITS.items() if abs(np.log(abs(ratio) / size)) < 1e-6]
+        units += [f"{name} elsewhere" for size, name in _UNITS.items() if abs(np.log(abs(ratio) * size)) < 1e-6]
+        units += ["turned round"] if ratio < 0 else []
+        why = f" ({', '.join(units)})" if units and self.right else ""
+        return f"the {label} reads {ratio:.3g} times {what} {when}{why}: " + ("put right" if self.right else "not used")
+
+
+def lapses(log: Log) -> tuple[Lapse, ...]:
+    """Find stretches in which speed or yaw rate contradict the fixes.
+
+    Parameters
+    ----------
+    log : Log
+
+    Returns
+    -------
+    tuple of Lapse
+        In order of time, those of the speed first; empty where the log lacks what tells.
+    """
+    believed = _without_repeats(log)
+    turned = _backwards(believed)
+    believed = put_right(believed, turned)
+    leaping = _leaping(believed)
+    believed = put_right(believed, leaping)
+    found = {name: _of(believed, name) for name in _FACTORS}
+    speed = sorted([*leaping, *found["speed_mps"]], key=lambda lapse: lapse.first)
+    return (*turned, *speed, *found["yaw_rate_radps"])
+
+
+def _backwards(log: Log) -> list[Lapse]:
+    """Return the whole of a speed whose sign is wrong: no car drives backwards for most of its way, and fast."""
+    t, values = log.stream("speed_mps")
+    if t.size < _FEWEST:
+        return []
+    way = np.diff(t) * values[1:]
+    fast = np.abs(values) > 0.5 * float(np.quantile(np.abs(values), 0.99))
+    if not way.sum() < -0.5 * np.abs(way).sum() or not float(np.mean(values[fast] < 0)) > 0.9:
+        return []
+    seen = evidence.windows(log, max(1.0, float(np.median(np.diff(log.t[log.fixed])))))
+    pace = float(np.quantile(seen.distance / (seen.stop - seen.start), 0.9)) if seen.start.size else 0.0
+    if pace < _FORWARD:
+        return []
+    return [Lapse("speed_mps", 0, len(log) - 1, -1.0, 1.0, float(values[0]), pace, True)]
+
+
+def put_right(log: Log, found: Sequence[Lapse]) -> Log:
+    """Return a log with its lapses put right or left out."""
+    changed: dict[str, Any] = {}
+    for lapse in found:
+        values = changed.setdefault(lapse.name, getattr(log, lapse.name).copy())
+        values[lapse.first : lapse.last + 1] *= lapse.factor
+    return replace(log, **changed) if changed else log
+
+
+def _without_repeats(log: Log) -> Log:
+    """Return a log without fixes that are exactly the one before: a frozen receiver says nothing of the speed."""
+    rows = np.flatnonzero(log.fixed)
+    same = np.concatenate(([False], (np.diff(log.lat_deg[rows]) == 0) & (np.diff(log.lon_deg[rows]) == 0)))
+    if not same.any():
+        return log
+    gone = np.zeros(len(log), dtype=bool)
+    gone[rows[same]] = True
+    return replace(log, lat_deg=np.where(gone, np.nan, log.lat_deg), lon_deg=np.where(gone, np.nan, log.lon_deg))
+
+
+def _leaping(log: Log) -> list[Lapse]:
+    """Return where the speed leaps away out of a car's reach and comes back, or says 0 and leaps, against the fixes.
+
+    Of a 0 that leaps at one end only and that fixes confirm elsewhere, what lies between that end and them is not used.
+    """
+    name = "speed_mps"
+    t, values = log.stream(name)
+    if t.size < _FEWEST:
+        return []
+    row = matched_factor(evidence.speed_ratio(log))
+    values = values * (row[2] if row is not None and row[3] == 1 else 1.0)
+    change = np.diff(values)
+    at = np.flatnonzero(np.abs(change) > LIMIT[name][0] + LIMIT[name][1] * np.diff(t) + BLIND[name]) + 1
+    new = np.flatnonzero(change != 0) + 1
+    fixes = log.t[log.fixed]
+    unseen = max(1.0, 2.0 * float(np.median(np.diff(fixes)))) if fixes.size > 1 else 1.0
+    rows = np.flatnonzero(np.isfinite(getattr(log, name)))
+    found: list[Lapse] = []
+    done = -1
+    for i, a in enumerate(at.tolist()):
+        if a <= done:
+            continue
+        before = values[a - 1]
+        ends = [b for b in at[i + 1 :].tolist() if t[b] - t[a] <= _AWAY]
+        ends = [
+            b for b in ends if change[a - 1] * change[b - 1] < 0 and abs(values[b] - before) < abs(change[a - 1]) / 2
+        ]
+        k = int(np.searchsorted(new, a))  # `new[k]` is `a`
+        if ends:
+            parts, pace = [(a, ends[0])], float(min(abs(before), abs(values[ends[0]])))
+        elif values[a] == 0:
+            stop = int(new[k + 1]) if k + 1 < new.size else t.size
+            parts, pace = [(a, stop), (a, min(stop, _before(t, fixes, a)))], abs(float(before))
+        elif before == 0:
+            first = int(new[k - 1]) if k else 0
+            parts, pace = [(first, a), (max(first, _after(t, fixes, a)), a)], abs(float(values[a]))
+        else:
+            continue
+        if _confirmed(log, t, values, *parts[0], pace):
+            # what no fix sees may be wrong nevertheless
+            parts = [(b, c) for b, c in parts[1:] if c > b and t[c - 1] - t[b] > unseen]
+        if not parts:
+            continue
+        first, stop = parts[0]
+        says = float(np.median(values[first:stop]))
+        found.append(Lapse(name, int(rows[first]), int(rows[stop - 1]), 0.0, 1.0, says, pace, False))
+        done = stop
+    return found
+
+
+def _before(t: Floats, fixes: Floats, a: int) -> int:
+    """Return the first sample that is not before the first fix from sample a on."""
+    k = int(np.searchsorted(fixes, t[a]))
+    return int(np.searchsorted(t, fixes[k])) if k < fixes.size else t.size
+
+
+def _after(t: Floats, fixes: Floats, a: int) -> int:
+    """Return the first sample after the last fix before sample a."""
+    k = int(np.searchsorted(fixes, t[a])) - 1
+    return int(np.searchsorted(t, fixes[k], side="right")) if k >= 0 else 0
+
+
+def _confirmed(log: Log, t: Floats, values: Floats, first: int, stop: int, pace: float) -> bool:
+    """Return whether the fixes beside some samples move as these say, and not at a pace.
+
+    Where there are none, those around them are asked how far the way along the yaw rate leads from one to the other.
+    """
+    inside = np.flatnonzero(log.fixed & (log.t >= t[first]) & (log.t <= t[stop - 1]))
+    if inside.size < 2:
+        return _nearer(log, t, values, first, stop, pace)
+    east, north = evidence.local_metres(log.lat_deg[inside], log.lon_deg[inside])
+    took = float(log.t[inside[-1]] - log.t[inside[0]])
+    shown = float(np.hypot(east[-1] - east[0], north[-1] - north[0])) / took
+    return abs(shown - float(np.abs(values[first:stop]).mean())) < abs(shown - pace)
+
+
+def _nearer(log: Log, t: Floats, values: Floats, first: int, stop: int, pace: float) -> bool:
+    """Return whether dead reckoning between the fixes around some samples comes nearer with them than at a pace."""
+    fixes = np.flatnonzero(log.fixed)
+    a, b = int(np.searchsorted(log.t[fixes], t[first])) - 1, int(np.searchsorted(log.t[fixes], t[stop - 1]))
+    if a < 0 or b >= fixes.size:
+        return False
+    ends = fixes[[a, b]]
+    east, north = evidence.local_metres(log.lat_deg[ends], log.lon_deg[ends])
+    apart = float(np.hypot(east[1] - east[0], north[1] - north[0]))
+    when = np.linspace(log.t[ends[0]], log.t[ends[1]], 2 + int(10 * (log.t[ends[1]] - log.t[ends[0]])))
+    clock, rate = log.stream("yaw_rate_radps")
+    factor = contradicted_yaw(evidence.turning(log)) or 1.0
+    turning = np.interp(when, clock, rate) * factor if clock.size else np.zeros(when.size)
+    step = np.diff(when)
+    azimuth = np.concatenate(([0.0], np.cumsum(step * 0.5 * (turning[1:] + turning[:-1]))))
+    speed = np.abs(np.interp(when, t, values))
+    at_pace = np.where((when >= t[first]) & (when <= t[stop - 1]), pace, speed)
+    off = []
+    for v in (speed, at_pace):
+        way = v * np.exp(1j * azimuth)
+        off.append(abs(abs(complex(np.sum(step * 0.5 * (way[1:] + way[:-1])))) - apart))
+    return off[0] < off[1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """What fixes and a stream say of windows of a drive, (n,) each.
+
+    Times on the clock of the fixes, what the fixes show, what the stream says at least and at most for a clock that is
+    a little off, how uncertain what the fixes show is; by how much the stream's clock is off, s, and whether they turn.
+    """
+
+    start: Floats
+    stop: Floats
+    shown: Floats
+    low: Floats
+    high: Floats
+    size: Floats
+    lag: float
+    turning: bool
+
+
+def _of(log: Log, name: str) -> list[Lapse]:
+    """Return the lapses of one stream."""
+    t, values = log.stream(name)
+    if t.size < _FEWEST or int(log.fixed.sum()) < _FEWEST:
+        return []
+    seen = _windows(log, name, t, values)
+    if seen is None:
+        return []
+    rows = np.flatnonzero(np.isfinite(getattr(log, name)))
+    if np.ptp(values) == 0 and float(np.std(seen.shown)) > 2 * float(np.median(seen.size)):
+        pace = float(np.median(np.abs(seen.shown)))
+        return [Lapse(name, 0, len(log) - 1, 0.0, 1.0, float(values[0]), pace, False)]
+    factors = np.array(_FACTORS[name])
+    cost = np.column_stack([_cost(seen, factor) for factor in factors])
+    leaping = np.abs(np.diff(values)) > _reach(t, values, name)
+    leap = np.flatnonzero(leaping)
+    from_, to = seen.start[:-1] - seen.lag - _SLACK[name], seen.stop[1:] - seen.lag + _SLACK[name]
+    # in degrees a rate leaps in each turn
+    leaps = (not seen.turning) & (np.searchsorted(t[leap + 1], to, side="right") > np.searchsorted(t[leap], from_))
+    state = _course(cost, np.where(leaps, _LEAP, _CHANGE))
+    turns = np.abs(seen.shown) > np.maximum(_TURN, _TURN_SIZES * seen.size)
+    wrong = cost[np.arange(state.size), state][turns] > 0.5 * _MOST
+    if seen.turning and wrong.size >= 2 * _STRETCH and wrong.mean() > _AGAINST:
+        pace = float(np.median(np.abs(seen.shown)))
+        return [Lapse(name, 0, len(log) - 1, float("nan"), 1.0, float(values[0]), pace, False)]
+    share = np.bincount(state, minlength=factors.size)
+    usual = int(np.argmax(np.where(np.isfinite(factors) & (factors != 0), share, -1)))
+    cuts = np.flatnonzero(np.diff(state)) + 1
+    found = []
+    for a, b in zip([0, *cuts.tolist()], [*cuts.tolist(), state.size], strict=True):
+        if state[a] == usual:
+            continue
+        clear = np.zeros(state.size, dtype=bool)
+        clear[a:b] = cost[a:b, usual] > 0.5 * _MOST
+        reads = _reads(seen, clear, state == usual, float(factors[state[a]]), float(factors[usual]))
+        if reads is None:
+            continue
+        told = None if seen.turning and abs(factors[state[a]]) != abs(factors[usual]) else leaping
+        first = 0 if a == 0 else _edge(t, values, told, *_open(cost, state, a, from_, to))
+        last = t.size - 1 if b == state.size else _edge(t, values, told, *_open(cost, state, b, from_, to)) - 1
+        pace = float(np.median(np.abs(seen.shown[clear])))
+        right = bool(reads == factors[state[a]] and reads != 0)
+        if last >= first:
+            ends = (0 if a == 0 else int(rows[first])), (len(log) - 1 if b == state.size else int(rows[last]))
+            found.append(Lapse(name, *ends, reads, float(factors[usual]), float(values[first]), pace, right))
+    return found
+
+
+def _reach(t: Floats, values: Floats, name: str) -> Floats:
+    """Return by how much a stream changes from each sample to the next (n-1,) without leaping."""
+    step, change = np.diff(t), np.abs(np.diff(values))
+    at_once, rate = LIMIT[name][:2]
+    changes = change[change > 0]
+    often = _OFTEN * float(np.quantile(changes, 0.99)) if changes.size >= _CHANGES else np.inf
+    # a slow sensor may change by much, but it hardly does
+    return np.minimum(at_once + rate * step, np.maximum(often, at_once + rate * float(step.min())))
+
+
+def _windows(log: Log, name: str, t: Floats, values: Floats) -> _Windows | None:
+    """Return windows in which fixes and a stream can be compared; None if they are too few."""
+    span = max(_SPAN[name], float(np.median(np.diff(log.t[log.fixed]))))
+    chord = evidence.windows(log, span)
+    took = chord.stop - chord.start
+    if took.size < _FEWEST:
+        return None
+    apart = _thinned(chord.start, span)
+    pace = (chord.distance / took)[apart]
+    noise = 1.4826 * float(np.median(np.abs(np.diff(pace, 2)))) / np.sqrt(6) if pace.size > 2 else 0.0
+    least, part = _SIZE[name]
+    if name == "speed_mps":
+        start, stop, shown = chord.start[apart], chord.stop[apart], pace
+        size = np.hypot(noise, least + part * shown)
+        values = np.abs(values)
+        per = stop - start
+    else:
+        start, stop, turned = evidence.turns(log, span)
+        apart = _thinned(start, span)
+        start, stop, turned = start[apart], stop[apart], turned[apart]
+        if start.size < _FEWEST:
+            return None
+        going = np.interp(start, 0.5 * (chord.start + chord.stop), chord.distance)
+        size = np.hypot(np.sqrt(2) * noise * span / np.maximum(going, 1.0), least + part * np.abs(turned))
+        shown, values, per = -turned, values, np.ones(start.size)
+    lags = np.arange(-_LAGS, _LAGS + 1e-9, _LAG)
+    said = np.stack([evidence.integral(t + lag, values, start, stop) / per for lag in lags])
+    known = np.isfinite(said).all(axis=0)
+    if int(known.sum()) < _FEWEST:
+        return None
+    start, stop, shown, size, said = start[known], stop[known], shown[known], size[known], said[:, known]
+    misfit = np.full(lags.size, np.inf)
+    for factor in _FACTORS[name]:
+        if np.isfinite(factor) and factor:
+            off = np.minimum(np.abs(shown - said / factor) / size, np.sqrt(2 * _MOST))
+            misfit = np.minimum(misfit, off.mean(axis=1))
+    best = int(np.argmin(misfit + 1e-3 * np.abs(lags)))
+    near = np.abs(lags - lags[best]) <= _SLACK[name] + 1e-9
+    low, high = said[near].min(axis=0), said[near].max(axis=0)
+    return _Windows(start, stop, shown, low, high, size, float(lags[best]), name != "speed_mps")
+
+
+def _thinned(start: Floats, span: float) -> NDArray[np.intp]:
+    """Return windows that hardly overlap, and no more of them than are looked at."""
+    kept, last = [], -np.inf
+    for k, when in enumerate(start.tolist()):
+        if when >= last + span * (1 - 1e-6):
+            kept.append(k)
+            last = when
+    every = max(1, -(-len(kept) // _WINDOWS))
+    return np.array(kept[::every], dtype=np.intp)
+
+
+def _cost(seen: _Windows, factor: float) -> Floats:
+    """Return how badly each window (n,) fits a stream that reads so many times the truth."""
+    if np.isnan(factor):
+        return np.full(seen.shown.size, _ANY)
+    if factor == 0:
+        # silent is what says 0 where it should not
+        off = np.where((seen.low == 0) & (seen.high == 0), 0.0, np.inf)
+    else:
+        low, high = np.minimum(seen.low / factor, seen.high / factor), np.maximum(seen.low / factor, seen.high / factor)
+        off = np.maximum(np.maximum(low - seen.shown, seen.shown - high), 0.0) / seen.size
+    return np.asarray(np.minimum(0.5 * off**2, _MOST))
+
+
+def _course(cost: Floats, change: Floats) -> NDArray[np.intp]:
+    """Return the states (n,) of least cost (n, S), where a change between two windows costs `change` (n-1,)."""
+    n, size = cost.shape
+    total, came = cost[0].copy(), np.zeros((n, size), dtype=np.intp)
+    for k in range(1, n):
+        best = int(np.argmin(total))
+        moved = total[best] + change[k - 1] < total
+        came[k] = np.where(moved, best, np.arange(size))
+        total = np.where(moved, total[best] + change[k - 1], total) + cost[k]
+    state = np.empty(n, dtype=np.intp)
+    state[-1] = int(np.argmin(total))
+    for k in range(n - 1, 0, -1):
+        state[k - 1] = came[k, state[k]]
+    return state
+
+
+def _reads(seen: _Windows, part: Mask, rest: Mask, factor: float, usual: float) -> float | None:
+    """Return what a stretch reads of the truth, None if it does not show clearly.
+
+    Its ratio to what the fixes show must be that factor times the ratio elsewhere, or else the same all along.
+    """
+    if int(part.sum()) < _STRETCH:
+        return None
+    if not seen.turning and float(np.median(seen.shown[part])) < _SLOW:
+        return None
+    if factor == 0 or seen.turning:
+        return factor
+    said = 0.5 * (seen.low + seen.high)
+    moving = (seen.shown > _SLOW) & (said > 0)
+    ratio = np.log(np.where(moving, said, 1.0) / np.where(moving, seen.shown, 1.0))
+    if int((part & moving).sum()) < _STRETCH:
+        return None
+    elsewhere = float(np.median(ratio[rest & moving])) if int((rest & moving).sum()) >= _STRETCH else np.log(usual)
+    low, middle, high = np.quantile(ratio[part & moving], (0.25, 0.5, 0.75))
+    away = middle - elsewhere
+    if np.isfinite(factor) and abs(away - np.log(factor / usual)) < FACTOR_NEAR:
+        return factor
+    steady = int((part & moving).sum()) >= 2 * _STRETCH and high - low < 2 * _CONSTANT and abs(away) > _OFF
+    return usual * float(np.exp(away)) if steady else None
+
+
+def _open(cost: Floats, state: NDArray[np.intp], k: int, from_: Floats, to: Floats) -> tuple[float, float]:
+    """Return between which times the state changes before window k: where both states fit alike nothing tells."""
+    alike = np.abs(cost[:, state[k - 1]] - cost[:, state[k]]) < _ALIKE
+    a, b = k, k
+    while a > 1 and alike[a - 1]:
+        a -= 1
+    while b < state.size - 1 and alike[b]:
+        b += 1
+    return float(from_[a - 1]), float(to[b - 1])
+
+
+def _edge(t: Floats, values: Floats, leaping: Mask | None, first: float, last: float) -> int:
+    """Return the first sample after a change between two times: where the stream leaps, or its noise changes."""
+    a, b = int(np.searchsorted(t, first)), int(np.searchsorted(t, last, side="right"))
+    if b - a < 2:
+        return min(b, t.size - 1)
+    step = np.abs(np.diff(values[a:b]))
+    if b - a < _FEWEST or (leaping is not None and leaping[a : b - 1].any()):
+        return a + 1 + int(np.argmax(step))
+    # two scales of Laplace's law, as likely as can be
+    total, n = np.cumsum(step), np.arange(1, step.size)
+    usual = 0.1 * float(step.mean()) + 1e-12
+    left, right = total[:-1] / n + usual, (total[-1] - total[:-1]) / (step.size - n) + usual
+    return a + 1 + int(np.argmin(n * np.log(left) + (step.size - n) * np.log(right)))
