@@ -13,7 +13,7 @@ import numpy as np
 from halfwidth.vehicle import adrift
 from halfwidth.vehicle.align import EDGE
 from halfwidth.vehicle.grid import sampled
-from halfwidth.vehicle.lapses import lapses, put_right
+from halfwidth.vehicle.lapses import lapses, put_right, words
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.sensors import STREAM, Calibration, Offset
 from halfwidth.vehicle.stamps import Stamps
@@ -111,7 +111,7 @@ def lapsing(log: Log) -> tuple[Item, Log]:
     found = lapses(log)
     if not found:
         return Item("lapses", "ok", "no stretch of the speed or yaw rate contradicts the fixes by a factor", 0.0), log
-    said = "; ".join(lapse.words(log) for lapse in found).replace(": put right", "").replace(": not used", "")
+    said = "; ".join(words(log, found)).replace(": put right", "").replace(": not used", "")
     item = Item("lapses", "bad", said, float(len(found)), line=fill_line(log))
     return item, put_right(log, found)
 

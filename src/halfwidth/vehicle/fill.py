@@ -37,6 +37,7 @@ from halfwidth.vehicle.estimators import METHODS, Method, heading_of, with_limit
 from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.lapses import lapses, put_right
+from halfwidth.vehicle.lapses import words as lapse_words
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pieces import CONTEXT, Piece, pieces_of, spans_of, wanted_rows, with_pauses_filled
@@ -224,7 +225,7 @@ def prepared(
         log = moved(log, far)
     if distrust:
         lapsed = lapses(log)
-        messages.extend(lapse.words(log) for lapse in lapsed)
+        messages.extend(lapse_words(log, lapsed))
         log = put_right(log, lapsed)
         log, said = azimuth_put_right(log)
         messages.extend([f"{said}: put right"] if said else [])

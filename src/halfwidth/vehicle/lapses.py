@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from halfwidth.vehicle import evidence
 from halfwidth.vehicle.log import Log
+from halfwidth.vehicle.rows import counted
 from halfwidth.vehicle.spikes import BLIND, LIMIT
 from halfwidth.vehicle.units import FACTOR_NEAR, contradicted_yaw, matched_factor
 
@@ -68,6 +69,12 @@ _AWAY, _FORWARD = 30.0, 6.0
 #: Two states fit a window alike if they cost so little more.
 _ALIKE = 0.5
 
+#: Lapses of a stream that are said one by one.
+_SAID = 5
+
+#: A way between two fixes is reckoned in so many steps a second, and so many at most.
+_RECKONED, _NODES = 10.0, 10_000
+
 #: Windows at most, so that a long drive takes no longer.
 _WINDOWS = 20_000
 
@@ -112,7 +119,8 @@ class Lapse:
         """Say what it is, with times."""
         label, t = _NAMES[self.name], log.t
         when = f"from {t[self.first]:.1f} s on" if self.last == len(log) - 1 else f"{t[self.last]:.1f} s"
-        when = when if self.last == len(log) - 1 else f"from {t[self.first]:.1f} to {when}"
+        if self.last < len(log) - 1:
+            when = f"from {t[self.first]:.1f} to {when}" if self.last > self.first else f"at {when}"
         if np.isnan(self.reads):
             return f"the {label} does not follow the turns that the fixes show: not used"
         if not self.reads:
@@ -151,6 +159,20 @@ def lapses(log: Log) -> tuple[Lapse, ...]:
     return (*turned, *speed, *found["yaw_rate_radps"])
 
 
+def words(log: Log, found: Sequence[Lapse]) -> list[str]:
+    """Say what lapses are: the first ones of each stream, and of the others how many they are."""
+    said: list[str] = []
+    for name in _FACTORS:
+        for right, done in ((True, "put right"), (False, "not used")):
+            own = [lapse for lapse in found if lapse.name == name and lapse.right == right]
+            said += [lapse.words(log) for lapse in own[:_SAID]]
+            if own[_SAID:]:
+                when = f"from {log.t[own[_SAID].first]:.1f} to {log.t[own[-1].last]:.1f} s"
+                more = counted(len(own) - _SAID, "more stretch")
+                said.append(f"the {_NAMES[name]} contradicts the fixes in {more} {when}: {done}")
+    return said
+
+
 def _backwards(log: Log) -> list[Lapse]:
     """Return the whole of a speed whose sign is wrong: no car drives backwards for most of its way, and fast."""
     t, values = log.stream("speed_mps")
@@ -159,6 +181,8 @@ def _backwards(log: Log) -> list[Lapse]:
     way = np.diff(t) * values[1:]
     fast = np.abs(values) > 0.5 * float(np.quantile(np.abs(values), 0.99))
     if not way.sum() < -0.5 * np.abs(way).sum() or not float(np.mean(values[fast] < 0)) > 0.9:
+        return []
+    if log.fixed.sum() < 2:
         return []
     seen = evidence.windows(log, max(1.0, float(np.median(np.diff(log.t[log.fixed])))))
     pace = float(np.quantile(seen.distance / (seen.stop - seen.start), 0.9)) if seen.start.size else 0.0
@@ -204,19 +228,19 @@ def _leaping(log: Log) -> list[Lapse]:
     fixes = log.t[log.fixed]
     unseen = max(1.0, 2.0 * float(np.median(np.diff(fixes)))) if fixes.size > 1 else 1.0
     rows = np.flatnonzero(np.isfinite(getattr(log, name)))
+    judge = _Judge.of(log, t, values) if at.size else None
     found: list[Lapse] = []
     done = -1
     for i, a in enumerate(at.tolist()):
         if a <= done:
             continue
         before = values[a - 1]
-        ends = [b for b in at[i + 1 :].tolist() if t[b] - t[a] <= _AWAY]
-        ends = [
-            b for b in ends if change[a - 1] * change[b - 1] < 0 and abs(values[b] - before) < abs(change[a - 1]) / 2
-        ]
+        ends = at[i + 1 : int(np.searchsorted(t[at], t[a] + _AWAY, side="right"))]
+        back = (change[a - 1] * change[ends - 1] < 0) & (np.abs(values[ends] - before) < abs(change[a - 1]) / 2)
         k = int(np.searchsorted(new, a))  # `new[k]` is `a`
-        if ends:
-            parts, pace = [(a, ends[0])], float(min(abs(before), abs(values[ends[0]])))
+        if back.any():
+            stop = int(ends[np.argmax(back)])
+            parts, pace = [(a, stop)], float(min(abs(before), abs(values[stop])))
         elif values[a] == 0:
             stop = int(new[k + 1]) if k + 1 < new.size else t.size
             parts, pace = [(a, stop), (a, min(stop, _before(t, fixes, a)))], abs(float(before))
@@ -225,7 +249,7 @@ def _leaping(log: Log) -> list[Lapse]:
             parts, pace = [(first, a), (max(first, _after(t, fixes, a)), a)], abs(float(values[a]))
         else:
             continue
-        if _confirmed(log, t, values, *parts[0], pace):
+        if judge is not None and judge.confirms(*parts[0], pace):
             # what no fix sees may be wrong nevertheless
             parts = [(b, c) for b, c in parts[1:] if c > b and t[c - 1] - t[b] > unseen]
         if not parts:
@@ -249,42 +273,59 @@ def _after(t: Floats, fixes: Floats, a: int) -> int:
     return int(np.searchsorted(t, fixes[k], side="right")) if k >= 0 else 0
 
 
-def _confirmed(log: Log, t: Floats, values: Floats, first: int, stop: int, pace: float) -> bool:
-    """Return whether the fixes beside some samples move as these say, and not at a pace.
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """What says whether a speed that leaps is right: samples, fixes, m, and the yaw rate in rad/s, put right."""
 
-    Where there are none, those around them are asked how far the way along the yaw rate leads from one to the other.
-    """
-    inside = np.flatnonzero(log.fixed & (log.t >= t[first]) & (log.t <= t[stop - 1]))
-    if inside.size < 2:
-        return _nearer(log, t, values, first, stop, pace)
-    east, north = evidence.local_metres(log.lat_deg[inside], log.lon_deg[inside])
-    took = float(log.t[inside[-1]] - log.t[inside[0]])
-    shown = float(np.hypot(east[-1] - east[0], north[-1] - north[0])) / took
-    return abs(shown - float(np.abs(values[first:stop]).mean())) < abs(shown - pace)
+    t: Floats
+    values: Floats
+    fixes: Floats
+    east: Floats
+    north: Floats
+    clock: Floats
+    rate: Floats
 
+    @classmethod
+    def of(cls, log: Log, t: Floats, values: Floats) -> "_Judge":
+        east, north = evidence.local_metres(log.lat_deg[log.fixed], log.lon_deg[log.fixed])
+        clock, rate = log.stream("yaw_rate_radps")
+        factor = contradicted_yaw(evidence.turning(log)) or 1.0
+        return cls(t, values, log.t[log.fixed], east, north, clock, rate * factor)
 
-def _nearer(log: Log, t: Floats, values: Floats, first: int, stop: int, pace: float) -> bool:
-    """Return whether dead reckoning between the fixes around some samples comes nearer with them than at a pace."""
-    fixes = np.flatnonzero(log.fixed)
-    a, b = int(np.searchsorted(log.t[fixes], t[first])) - 1, int(np.searchsorted(log.t[fixes], t[stop - 1]))
-    if a < 0 or b >= fixes.size:
-        return False
-    ends = fixes[[a, b]]
-    east, north = evidence.local_metres(log.lat_deg[ends], log.lon_deg[ends])
-    apart = float(np.hypot(east[1] - east[0], north[1] - north[0]))
-    when = np.linspace(log.t[ends[0]], log.t[ends[1]], 2 + int(10 * (log.t[ends[1]] - log.t[ends[0]])))
-    clock, rate = log.stream("yaw_rate_radps")
-    factor = contradicted_yaw(evidence.turning(log)) or 1.0
-    turning = np.interp(when, clock, rate) * factor if clock.size else np.zeros(when.size)
-    step = np.diff(when)
-    azimuth = np.concatenate(([0.0], np.cumsum(step * 0.5 * (turning[1:] + turning[:-1]))))
-    speed = np.abs(np.interp(when, t, values))
-    at_pace = np.where((when >= t[first]) & (when <= t[stop - 1]), pace, speed)
-    off = []
-    for v in (speed, at_pace):
-        way = v * np.exp(1j * azimuth)
-        off.append(abs(abs(complex(np.sum(step * 0.5 * (way[1:] + way[:-1])))) - apart))
-    return off[0] < off[1]
+    def confirms(self, first: int, stop: int, pace: float) -> bool:
+        """Return whether the fixes beside some samples move as these say, and not at a pace.
+
+        Where there are none, those around them are asked how far the way along the yaw rate leads.
+        """
+        a = int(np.searchsorted(self.fixes, self.t[first]))
+        b = int(np.searchsorted(self.fixes, self.t[stop - 1], side="right")) - 1
+        if b <= a:
+            return self._nearer(first, stop, pace)
+        shown = self._apart(a, b) / float(self.fixes[b] - self.fixes[a])
+        return abs(shown - float(np.abs(self.values[first:stop]).mean())) < abs(shown - pace)
+
+    def _nearer(self, first: int, stop: int, pace: float) -> bool:
+        """Return whether dead reckoning between the fixes around samples comes nearer with them than at a pace."""
+        begin, end = self.t[first], self.t[stop - 1]
+        a, b = int(np.searchsorted(self.fixes, begin)) - 1, int(np.searchsorted(self.fixes, end))
+        if a < 0 or b >= self.fixes.size:
+            return False
+        apart, length = self._apart(a, b), float(self.fixes[b] - self.fixes[a])
+        when = np.linspace(self.fixes[a], self.fixes[b], 2 + int(min(_RECKONED * length, _NODES)))
+        turning = np.interp(when, self.clock, self.rate) if self.clock.size else np.zeros(when.size)
+        step = np.diff(when)
+        azimuth = np.concatenate(([0.0], np.cumsum(step * 0.5 * (turning[1:] + turning[:-1]))))
+        speed = np.abs(np.interp(when, self.t, self.values))
+        at_pace = np.where((when >= begin) & (when <= end), pace, speed)
+        off = []
+        for v in (speed, at_pace):
+            way = v * np.exp(1j * azimuth)
+            off.append(abs(abs(complex(np.sum(step * 0.5 * (way[1:] + way[:-1])))) - apart))
+        return off[0] < off[1]
+
+    def _apart(self, a: int, b: int) -> float:
+        """Return how far two fixes are apart, m."""
+        return float(np.hypot(self.east[b] - self.east[a], self.north[b] - self.north[a]))
 
 
 @dataclass(frozen=True, eq=False)

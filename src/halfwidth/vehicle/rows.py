@@ -101,7 +101,7 @@ def _period(stamps: Floats, count: float) -> float | None:
 
 def counted(count: int, noun: str) -> str:
     """Say how many of something there are."""
-    return f"{count} {noun}{'' if count == 1 else 's' if noun[-1] != 'x' else 'es'}"
+    return f"{count} {noun}{'' if count == 1 else 'es' if noun[-1] in 'xh' else 's'}"
 
 
 @dataclass
