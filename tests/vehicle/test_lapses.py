@@ -8,7 +8,7 @@ from tests.vehicle.test_faults import in_gaps
 
 from halfwidth.vehicle import check, fill, simulate_drive
 from halfwidth.vehicle.formats import read
-from halfwidth.vehicle.lapses import lapses, put_right
+from halfwidth.vehicle.lapses import lapses, put_right, words
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.spikes import spikes
 
@@ -178,3 +178,35 @@ def test_what_is_left_of_spikes_is_no_lapse(drive):
     speed[[500, 900, 1500, 2600]] = 0.0
     wrong = replace(log, speed_mps=speed)
     assert lapses(spikes(wrong).masked(wrong)) == ()
+
+
+def test_a_speed_that_leaps_all_the_time_is_told_in_few_words(drive):
+    _, log = drive
+    says = np.flatnonzero(np.isfinite(log.speed_mps))
+    speed = log.speed_mps.copy()
+    speed[says[::2]] = 0.0
+    wrong = replace(log, speed_mps=speed)
+    found = lapses(wrong)
+    said = words(wrong, found)
+    assert len(found) > 100
+    assert len(said) == 6
+    assert f"{len(found) - 5} more stretches from" in said[-1]
+    assert " at " in said[0]  # one sample has one time
+
+
+@pytest.mark.parametrize("left", [0, 1])
+def test_a_negative_speed_without_fixes_is_no_lapse(drive, left):
+    _, log = drive
+    seen = np.isin(np.arange(len(log)), np.flatnonzero(log.fixed)[:left])
+    none = {name: np.where(seen, getattr(log, name), np.nan) for name in ("lat_deg", "lon_deg")}
+    assert lapses(replace(log, speed_mps=-np.abs(log.speed_mps) - 5.0, **none)) == ()
+
+
+def test_a_speed_that_is_silent_among_fixes_is_that_of_the_fixes(drive):
+    _, log = drive
+    silent = (log.t > 270.0) & (log.t < 380.0)
+    track = fill(replace(log, speed_mps=np.where(silent, np.nan, log.speed_mps)))
+    inside = (track.t_s > 275.0) & (track.t_s < 375.0)
+    says = np.isfinite(log.speed_mps)
+    off = track.speed_mps[inside] - np.interp(track.t_s[inside], log.t[says], log.speed_mps[says])
+    assert np.sqrt(np.mean(off**2)) < 1.0

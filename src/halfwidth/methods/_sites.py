@@ -230,11 +230,6 @@ def sites(model: Linear, record: Record, *, outliers: bool = False, frames: dict
     return Sites(frame, floor, scale, *_first_state(model, record), b, frame.targets(y))
 
 
-def _seen(record: Record) -> list[Array]:
-    """Return the seen values of each output."""
-    return [v[there] for v, there in zip(record.y.T, record.seen.T, strict=True)]
-
-
 def _half_open(x0: Any) -> bool:
     """Say whether a box has an end without the other: a bound of the first state, which is in the frame."""
     return isinstance(x0, Box) and bool((np.isfinite(x0.lo) ^ np.isfinite(x0.hi)).any())

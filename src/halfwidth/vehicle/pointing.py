@@ -105,7 +105,8 @@ def _direction(drive: Grid) -> Floats:
 def with_speed(drive: Grid) -> Grid:
     """Give a drive without a speed sensor the speed of its fixes, changing evenly where there are none.
 
-    Where no fix is near, the guess may be off by 0.7 m/s for each second to the next one, at most by 5 m/s.
+    Where no fix is near, the guess may be off by 0.7 m/s for each second to the next one, at most by 5 m/s. Where a
+    sensor is silent for a while the speed is that of the fixes that come meanwhile.
 
     Parameters
     ----------
@@ -114,13 +115,14 @@ def with_speed(drive: Grid) -> Grid:
     Returns
     -------
     Grid
-        The same where it has a speed.
+        The same where it has a speed all along.
     """
-    if drive.has_speed:
+    silent = drive.speed_sd > 0
+    if drive.has_speed and not silent.any():
         return drive
     when, took, moved = _secants(drive)
     if when.size == 0:
-        return replace(drive, speed_sd=np.full(len(drive), 5.0), has_speed=True)
+        return drive if drive.has_speed else replace(drive, speed_sd=np.full(len(drive), 5.0), has_speed=True)
     h = drive.h
     middle = drive.t - 0.5 * h
     k = np.searchsorted(when, middle)
@@ -132,6 +134,8 @@ def with_speed(drive: Grid) -> Grid:
     pause = np.where(outside, 2 * far, after - before)
     sd = np.minimum(0.7 * far, 5.0) * np.sqrt(np.maximum(pause / h, 1.0))
     lost = pause > 1.5 * float(np.median(took))
-    return replace(
-        drive, speed=np.interp(middle, when, np.abs(moved) / took), speed_sd=np.where(lost, sd, 0.0), has_speed=True
-    )
+    speed = np.interp(middle, when, np.abs(moved) / took)
+    if drive.has_speed:
+        # how far off it may be stays: fixes that stray are not to be believed as a sensor is
+        return replace(drive, speed=np.where(silent & ~lost, speed, drive.speed))
+    return replace(drive, speed=speed, speed_sd=np.where(lost, sd, 0.0), has_speed=True)
