@@ -144,3 +144,13 @@ def test_masking_may_silence_the_sensors_as_a_log_without_them_is():
     np.testing.assert_array_equal(hidden.yaw_rate, whole.yaw_rate)
     everything = whole.masked(np.ones(len(whole), dtype=bool), ("speed", "yaw_rate"))
     assert np.isfinite(everything.speed).all()
+
+
+@pytest.mark.parametrize("name", ["speed", "yaw_rate"])
+def test_one_sample_is_no_sensor(name):
+    t = np.arange(0, 60.01, 0.5)
+    unit = {"speed": "mps", "yaw_rate": "radps"}[name]
+    once = {f"{name}_{unit}": np.where(t == 0, 0.4, np.nan)}
+    grid = sampled(line(t, **once))
+    assert not getattr(grid, f"has_{name}")
+    assert not getattr(grid, name).any()

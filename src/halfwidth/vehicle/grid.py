@@ -170,7 +170,7 @@ def sampled(
     frame = Frame.of(log) if frame is None else frame
     kept = fixed[_thinned(log.t[fixed])]
     t_fix = log.t[kept]
-    streams = {name: sensors.stream(log, name) for name in DRIFT}
+    streams = {name: _spoken(*sensors.stream(log, name)) for name in DRIFT}
     t = _nodes(log, t_fix, [clock for clock, _ in streams.values()])
     at = np.searchsorted(t, t_fix)
     T = t.size
@@ -226,6 +226,11 @@ def _thinned(t: Floats) -> list[int]:
         if k >= len(times):
             return kept
         kept.append(k)
+
+
+def _spoken(clock: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Return a stream, without its sample if it has one only: that says nothing of the rest of a drive."""
+    return (clock, values) if clock.size > 1 else (clock[:0], values[:0])
 
 
 def _nodes(log: Log, t_fix: Floats, clocks: list[Floats]) -> Floats:
