@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from halfwidth.vehicle import simulate_drive
+from halfwidth.vehicle import fill, simulate_drive
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.fade import fades
 from halfwidth.vehicle.formats import read
@@ -102,3 +102,14 @@ def test_through_a_gap_without_a_sensor_no_fade_is_seen(drive):
     wrong = np.where(lost, 0.5 * grid.speed, grid.speed)
     assert strays(replace(grid, speed=wrong), sensors).at.size  # a wrong speed looks like wrong fixes
     assert not strays(replace(grid, speed=wrong, speed_sd=np.where(lost, 0.5, grid.speed_sd)), sensors).at.size
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+@pytest.mark.parametrize("tunnel", [10.0, 25.0])
+def test_multipath_behind_a_tunnel_does_not_bend_the_way_through_it(seed, tunnel):
+    truth, log = simulate_drive(duration=240, seed=seed, tunnels=[tunnel], fix_offset=0.4, multipath=4.0)
+    track = fill(log)
+    (begin, end), *_ = truth.outages
+    inside = (track.t_s > begin) & (track.t_s < end)
+    error = np.hypot(*truth.error_m(track.t_s, track.lat_deg, track.lon_deg))
+    assert error[inside].max() < 1.5  # .3 m without multipath, 3 to 5 m where it is believed

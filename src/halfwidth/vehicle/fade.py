@@ -29,11 +29,12 @@ _TAU, _FINER = 2.0 ** np.arange(-1.0, 4.0), 2.0 ** np.array([-0.75, -0.5, -0.25,
 #: How far off a fade begins, m, a standard deviation of each axis.
 _WIDE = 10.0
 
-#: The chain that is asked whether it was a fault or a jump of the slow error.
-JUDGE = chain.Chain(rounds=16)
+#: The chain that is asked whether it was a fault or a jump of the slow error. A slow error that hardly moves is learnt
+#: slowly, and one that is taken to move more than it does explains every fade.
+JUDGE = chain.Chain(rounds=40)
 
-#: The same, for the noise without the doubtful fixes; half of the worth is hope enough to look closer.
-_LEARNING, _HOPE = chain.Chain(rounds=8), 0.5
+#: Half of the worth is hope enough to look closer.
+_HOPE = 0.5
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def fades(drives: Sequence[Grid], own: Sequence[NDArray[np.intp]], since: Sequen
         The gain is that of `likely` where there is hope that it exceeds the worth, else 0.
     """
     hidden = [drive.masked(np.isin(np.arange(len(drive)), k)) for drive, k in zip(drives, own, strict=True)]
-    learnt = chain.solve(hidden, _LEARNING)
+    learnt = chain.solve(hidden, JUDGE)
     places = [_Place(*place) for place in zip(drives, own, since, learnt, strict=True)]
     found = _best(places, [_TAU] * len(places))
     hope = [i for i, fade in enumerate(found) if fade.gain > _HOPE * fade.worth]
