@@ -113,7 +113,7 @@ def test_no_row_speaks_twice():
         gone = max(newest - 9, 0)
         for told in () if known is None else known:
             assert told.item() <= gone / 10 + 1e-9
-        carried.waiting.append((newest, one.times(0.1), Known.none(1)))
+        carried.waiting.append((newest, one.times(0.1), Known.none(1), 1))
     assert carried.gone.precision[0, 0] == pytest.approx(3.0)
 
 

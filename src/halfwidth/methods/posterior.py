@@ -49,8 +49,8 @@ from halfwidth.result import Estimate
 
 #: Power of the half-widths' prior; see above.
 POWER = 0.4
-#: Nodes of a stage, and most stages (core/ep_learn.hpp).
-_STAGE, _STAGES = 16, 8
+#: Nodes of a stage, and most stages; nodes of a light window (core/ep_learn.hpp).
+_STAGE, _STAGES, _LIGHT = 16, 8, 8
 #: Power of a half-width in which its posterior is nearly Gaussian: 0 is no tail there.
 WARP = 0.5
 #: Numbers that the beliefs of all nodes may take up; one stage is always had.
@@ -329,9 +329,13 @@ class Posterior:
             limits |= _MIXED
         if exact:
             limits["most"] = 1
+        z = nodes(q, count)
+        limits["light"] = _LIGHT if 0 < q < _LIGHT <= count // 2 else 0
+        if limits["light"]:
+            z = np.concatenate([design(q), z])
         return _core.EpFrame(
             frame.problem, frame.free, frame.cap, frame.count, frame.fitted, learn_rate, rate,
-            math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, nodes(q, count), limits,
+            math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z, limits,
             frame.outside if limits["condition"] > 0 else None,
         )  # fmt: skip
 
@@ -347,6 +351,16 @@ class Posterior:
         if self.outliers is True:
             return 0.01, True, _RATE
         return float(self.outliers), False, (1.0, 1.0)
+
+
+@functools.lru_cache(maxsize=8)
+def design(q: int) -> Array:
+    """Return the eight points (8, q), q < 8, of a light window: columns of a Hadamard matrix, of mean 0 and covariance 1.
+
+    As far as there are columns none is the product of two others.
+    """
+    two = np.array([[1.0, 1.0], [1.0, -1.0]])
+    return np.ascontiguousarray(np.kron(two, np.kron(two, two))[:, [1, 2, 4, 7, 3, 5, 6][:q]])
 
 
 @functools.lru_cache(maxsize=64)
