@@ -440,6 +440,7 @@ class EpFrame {
         l_.reference = real("reference");
         l_.condition = real("condition");
         l_.again = whole("again");
+        l_.calm = whole("calm");
         p_.a.damping = real("damping");
     }
 

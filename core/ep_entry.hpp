@@ -84,7 +84,7 @@ struct EpLearnArgs {
     const double *floor, *cap, *scale;       // (groups,): bounds, and the order of size
     const double* start;                     // (groups,): first guess, and the half-widths that `before` belongs to
     const EpBefore* before;                  // sites to start from; or null
-    int again;                               // windows that may go without a search for their mode, one after the other
+    int again, calm;                         // windows that may go without a search for their mode, one after the other; light ones
     int shaped;                              // first stage whose skewness and kurtosis are asked for
     const double* count;                     // (groups,): rows of each
     bool learn_eps;

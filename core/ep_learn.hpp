@@ -34,6 +34,7 @@ constexpr double ep_wide = 1.15;  // by how much a stage reaches farther than th
 constexpr double ep_least = 3.0;   // effective points without which nothing is to be trusted
 constexpr double ep_some = 10.0;  // effective points without which the evidence itself is in doubt
 constexpr int ep_few = 2;     // rows that may come or go while the mode stays
+constexpr int ep_never = 1 << 20; // of windows since a search: the next one searches
 constexpr double ep_sure = 0.25;  // standard deviations in which a step of Newton errs by no more than the mode may
 constexpr double ep_apart = 1.0;  // disagreement of moments, in standard deviations, beyond which no step is taken
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
@@ -608,7 +609,8 @@ struct EpLearner {
         plan(stage[stages_used], m, S);
     }
     // mean over the states of the share of their variance that lies between points
-    double between(int total, const double* share) const {
+    double between(int total) const {
+        const double* share = a.share;
         const EpArgs& b = a.base;
         const std::ptrdiff_t size = stage_count();
         double all = 0.0;
@@ -627,11 +629,11 @@ struct EpLearner {
         return all / size;
     }
 
-    // What a light window's design leaves in doubt of the states, in standard deviations, by what these points found. It has
-    // the mean and the covariance of their law, so with even weights moments that are linear in s^warp would be exact: it
-    // errs by as much as weights are uneven.
-    double doubt(int total, double effective) const {
-        return std::sqrt(between(total, a.share) * max2(total / effective - 1.0, 0.0) / a.light);
+    // What a number of points leaves in doubt of the states, in standard deviations, by what `total` points found. A stage
+    // has the mean and the covariance of its law, so with even weights what is linear in s^warp would be exact: points err
+    // by as much as their weights are uneven.
+    double doubt(int total, double effective, int count) const {
+        return std::sqrt(between(total) * max2(total / effective - 1.0, 0.0) / count);
     }
 
     // weighted raw moments about `centre`
@@ -765,8 +767,9 @@ struct EpLearner {
         double best = minus_inf;
         *a.log_prior = 0.0;
         int code = 0;
-        const bool again = q > 0 && warm && a.before->lanes && a.before->since < a.again && a.before->drop <= ep_few &&
-                           b.T - a.before->common <= ep_few;
+        const bool calm = a.light > 0 && warm && a.before->lanes && a.before->doubt < a.enough;  // a light window may do
+        const bool again = q > 0 && warm && a.before->lanes && a.before->since < (calm ? a.calm : a.again) &&
+                           a.before->drop <= ep_few && b.T - a.before->common <= ep_few;
         if (again) {  // about where the nodes of the window before were
             double d[ep_free];
             for (int j = 0; j < q; j++) {
@@ -813,7 +816,7 @@ struct EpLearner {
             b.tau[k] = keep_tau[k];
             b.nu[k] = keep_nu[k];
         }
-        light = again && a.light > 0 && !alone(H) && a.before->doubt < a.enough;
+        light = again && calm && !alone(H);
         const int nodes = alone(H) ? 1 : light ? a.nodes : a.nodes - a.light;
         ep.cross = wanted;
         if (outside) outside->cross = around;
@@ -851,18 +854,17 @@ struct EpLearner {
             if (nodes > 1) stages_used++;
             effective = weigh(phi, done, a.share, &log_sum);
             if (done == nodes) break;
-            if (light && done == a.light) {
-                if (effective > ep_least && doubt(done, effective) < a.enough) break;
-            } else if (effective > ep_some && between(done, a.share) < effective * a.enough * a.enough) {
-                break;
-            }
+            // elsewhere half-widths are asked for as well, which want points enough even if those were drawn at random
+            const double least = light && done == a.light ? ep_least : ep_some;
+            const double left_open = calm ? doubt(done, effective, done) : std::sqrt(between(done) / effective);
+            if (effective > least && left_open < a.enough) break;
             if (effective > 0.0) refit(phi, done, a.share, effective, S);
             else stage[stages_used] = now;
         }
         *a.used = done;
         if (!(effective > 0.0)) return 2;
         *a.tells = !light || done > a.light;
-        *a.doubt = a.light ? doubt(done, effective) : 0.0;
+        *a.doubt = a.light ? doubt(done, effective, a.light) : 0.0;
         ep.block = {0, wide_lanes - 1};
         int heaviest = 0;
         for (int k = 1; k < done; k++)
@@ -887,7 +889,7 @@ struct EpLearner {
         *a.log_evidence = log_sum + (nodes > 1 ? -std::log(static_cast<double>(done)) : 0.5 * q * log_2pi) - half_log_det;
         *a.sweeps_used = sweeps;
         *a.since = again ? a.before->since + 1 : 0;
-        if (!next_centre(done, phi, H, effective) || nodes == 1) *a.since = a.again;
+        if (!next_centre(done, phi, H, effective) || nodes == 1) *a.since = ep_never;
         return code;
     }
 };

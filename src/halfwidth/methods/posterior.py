@@ -68,7 +68,7 @@ _LONG = 2000
 _FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
 #: A window takes over centre and nodes of the one before, where it would search for its mode, at most so often in a row
-#: and in an eighth of its rows.
+#: and in an eighth of its rows; light windows in a quarter of them.
 _AGAIN = 4
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
@@ -314,7 +314,7 @@ class Posterior:
         stages, q = len(frame.problem["start"]) - 1, frame.q + learn_rate
         limits = dict(_LIMITS)
         limits["condition"] = condition(stages - 1) if first else 0.0  # `known` sees to it
-        limits["again"] = min((stages - 1) // 8, _AGAIN)
+        limits["again"], limits["calm"] = min((stages - 1) // 8, _AGAIN), (stages - 1) // 4 if stages > 8 else 0
         rows = max(float(frame.count.sum()), 1.0)
         limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
         limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
