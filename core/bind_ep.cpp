@@ -257,7 +257,7 @@ class EpHanded : public EpArrays {
         add("nu", {rows}, &nu);
         add("lanes", {2 * (stages * n + rows), columns}, &lanes);
         add("lane_phi", {columns, q}, &lane_phi);
-        add("mode", {q}, &mode);
+        add("centre", {q}, &centre);
         add("H", {q, q}, &H);
         add("edge_x", {stages, n}, &edge_x);
         add("edge_P", {stages, n, n}, &edge_P);
@@ -266,8 +266,8 @@ class EpHanded : public EpArrays {
     std::vector<std::int32_t> start;
     std::size_t n, q, columns;
     double *m = nullptr, *D = nullptr, *tau = nullptr, *nu = nullptr, *lanes = nullptr, *lane_phi = nullptr;
-    double *mode = nullptr, *H = nullptr, *edge_x = nullptr, *edge_P = nullptr;
-    double log_mode = 0.0, log_prior = 0.0;
+    double *centre = nullptr, *H = nullptr, *edge_x = nullptr, *edge_P = nullptr;
+    double log_mode = 0.0, log_prior = 0.0, doubt = 0.0;
     int since = 0;
 
     std::size_t stages() const { return start.size() - 1; }
@@ -282,22 +282,22 @@ nb::object state(const EpHanded& h, std::size_t a) {
     return nb::make_tuple(found_x, found_P);
 }
 
-constexpr const char* handed_names[] = {"m", "D", "tau", "nu", "lanes", "lane_phi", "mode", "H", "edge_x", "edge_P"};
+constexpr const char* handed_names[] = {"m", "D", "tau", "nu", "lanes", "lane_phi", "centre", "H", "edge_x", "edge_P"};
 
 nb::tuple save(nb::handle self) {
     EpHanded& h = *nb::inst_ptr<EpHanded>(self);
     nb::list starts, found;
     for (std::int32_t s : h.start) starts.append(s);
     for (const char* name : handed_names) found.append(h.get(name, self));
-    return nb::make_tuple(starts, h.n, h.q, h.columns, h.log_mode, h.log_prior, h.since, found);
+    return nb::make_tuple(starts, h.n, h.q, h.columns, h.log_mode, h.log_prior, h.doubt, h.since, found);
 }
 
 void load(EpHanded* into, const std::vector<std::int32_t>& start, std::size_t n, std::size_t q, std::size_t columns, double log_mode,
-          double log_prior, int since, const std::vector<In>& arrays) {
+          double log_prior, double doubt, int since, const std::vector<In>& arrays) {
     want(start.size() >= 2 && start.front() == 0 && n >= 1 && arrays.size() == std::size(handed_names), "what `save` returned");
     for (std::size_t t = 1; t < start.size(); t++) want(start[t - 1] <= start[t], "start must not fall");
     EpHanded* h = new (into) EpHanded(start.data(), start.size() - 1, n, q, columns);
-    double* to[] = {h->m, h->D, h->tau, h->nu, h->lanes, h->lane_phi, h->mode, h->H, h->edge_x, h->edge_P};
+    double* to[] = {h->m, h->D, h->tau, h->nu, h->lanes, h->lane_phi, h->centre, h->H, h->edge_x, h->edge_P};
     const std::size_t stages = h->stages(), rows = start.back();
     const std::size_t noise = stages * n;
     const std::size_t sizes[] = {noise, noise, rows, rows, 2 * (noise + rows) * columns, columns * q, q, q * q, noise, noise * n};
@@ -312,6 +312,7 @@ void load(EpHanded* into, const std::vector<std::int32_t>& start, std::size_t n,
     }
     h->log_mode = log_mode;
     h->log_prior = log_prior;
+    h->doubt = doubt;
     h->since = since;
 }
 
@@ -321,8 +322,8 @@ class EpFound : public EpArrays {
   public:
     int code = 0, nodes = 0, since = 0;
     long sweeps = 0;
-    bool finite = false, with_rate = false;
-    double rate = 0.0, effective = 0.0, log_evidence = 0.0, log_prior = 0.0, log_mode = 0.0, residual = 0.0;
+    bool finite = false, with_rate = false, tells = false;
+    double rate = 0.0, doubt = 0.0, effective = 0.0, log_evidence = 0.0, log_prior = 0.0, log_mode = 0.0, residual = 0.0;
 };
 
 nb::object item(nb::handle self, const char* name) {
@@ -332,6 +333,8 @@ nb::object item(nb::handle self, const char* name) {
     if (is("nodes")) return nb::cast(f.nodes);
     if (is("sweeps")) return nb::cast(f.sweeps);
     if (is("finite")) return nb::cast(f.finite);
+    if (is("tells")) return nb::cast(f.tells);
+    if (is("doubt")) return nb::cast(f.doubt);
     if (is("effective")) return nb::cast(f.effective);
     if (is("log_evidence")) return nb::cast(f.log_evidence);
     if (is("log_prior")) return nb::cast(f.log_prior);
@@ -427,7 +430,9 @@ class EpFrame {
         l_.close = real("close");
         l_.near = real("near");
         l_.least = real("least");
+        l_.light = whole("light");
         l_.stage = whole("stage");
+        want(l_.light >= 0 && l_.light < l_.nodes && l_.light % hw::ep_abreast == 0, "light: whole registers, and not all nodes");
         l_.enough = real("enough");
         l_.usable = real("usable");
         l_.narrow = real("narrow");
@@ -435,6 +440,7 @@ class EpFrame {
         l_.reference = real("reference");
         l_.condition = real("condition");
         l_.again = whole("again");
+        l_.calm = whole("calm");
         p_.a.damping = real("damping");
     }
 
@@ -475,6 +481,8 @@ class EpFrame {
         l.edge_P = handed.edge_P;
         l.since = &found.since;
         l.log_mode = &found.log_mode;
+        l.tells = &found.tells;
+        l.doubt = &found.doubt;
         hw::EpBefore old{};
         if (!before.is_none()) {
             const EpHanded& h = *nb::cast<const EpHanded*>(before);
@@ -489,10 +497,11 @@ class EpFrame {
             if (h.columns == handed.columns && h.q == q_) {
                 old.lanes = h.lanes;
                 old.lane_phi = h.lane_phi;
-                old.mode = h.mode;
+                old.centre = h.centre;
                 old.H = h.H;
                 old.log_mode = h.log_mode;
                 old.log_prior = h.log_prior;
+                old.doubt = h.doubt;
                 old.since = h.since;
             }
             l.before = &old;
@@ -507,7 +516,7 @@ class EpFrame {
         found.add("s", {groups}, &mode);
         found.add("told", {groups * (groups + 2)}, &told);
         found.add("mode", {q_}, &l.mode);
-        l.next = handed.mode;
+        l.next = handed.centre;
         found.add("H", {q_, q_}, &l.H);
         found.add("phi", {nodes, q_}, &l.phi);
         found.add("log_weight", {nodes}, &l.log_weight);
@@ -569,6 +578,7 @@ class EpFrame {
         found.with_rate = l.learn_eps;
         handed.log_prior = found.log_prior;
         handed.log_mode = found.log_mode;
+        handed.doubt = found.doubt;
         handed.since = found.since;
         std::copy(l.H, l.H + q_ * q_, handed.H);
         return nb::make_tuple(made, on);
@@ -608,7 +618,7 @@ void bind_ep(nb::module_& mod) {
     mod.def("ep_taken", &taken, "free"_a, "start"_a, "pull"_a, "precision"_a, "power"_a,
             "What is known of the free half-widths alone, whatever the others are; see core/ep_handover.hpp.");
     nb::class_<EpHanded>(mod, "EpHanded", "What the next window of a stream may take up; see core/ep_handover.hpp.")
-        .def("__init__", &load, "start"_a, "n"_a, "q"_a, "columns"_a, "log_mode"_a, "log_prior"_a, "since"_a, "arrays"_a)
+        .def("__init__", &load, "start"_a, "n"_a, "q"_a, "columns"_a, "log_mode"_a, "log_prior"_a, "doubt"_a, "since"_a, "arrays"_a)
         .def("state", &state, "a"_a, "Mean and covariance of x_a given what lies up to it, None where they are no Gaussian's.")
         .def("save", &save, "All of it, as the arguments of another one.")
         .def("__getitem__", [](nb::handle self, const char* name) {

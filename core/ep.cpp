@@ -231,7 +231,7 @@ int ep_learn(const EpLearnArgs& given) {
     const int q = static_cast<int>(learner_parameters(a));
     *a.finite = ep_sound(a);
     ep_widths(a, q, rest);
-    ep_told(a, q, rest);
+    if (*a.tells) ep_told(a, q, rest);
     double own[ep_states] = {};
     for (int g = 0, j = 0; g < p && a.base.group_Q; g++) {
         const double s = a.free[g] ? std::exp(a.mode[j++]) : a.start[g];

@@ -67,8 +67,8 @@ struct EpBefore {
     const std::int32_t* start;        // (stages+1,)
     const double *m, *D, *tau, *nu;   // (stages,n), (start[stages],)
     const double *lanes, *lane_phi;   // as those of EpLearnArgs, of as many columns; or null. With them:
-    const double *mode, *H;           // (q,), (q,q)
-    double log_mode, log_prior;
+    const double *centre, *H;         // (q,), (q,q): of its nodes
+    double log_mode, log_prior, doubt;
     int since;                        // windows since the mode was searched for
     // rows that both hold: found by `ep_shift`
     int common, low, high, there;     // stages but the first; rows here, and the first of them there
@@ -84,7 +84,7 @@ struct EpLearnArgs {
     const double *floor, *cap, *scale;       // (groups,): bounds, and the order of size
     const double* start;                     // (groups,): first guess, and the half-widths that `before` belongs to
     const EpBefore* before;                  // sites to start from; or null
-    int again;                               // windows that may go without a search for their mode, one after the other
+    int again, calm;                         // windows that may go without a search for their mode, one after the other; light ones
     int shaped;                              // first stage whose skewness and kurtosis are asked for
     const double* count;                     // (groups,): rows of each
     bool learn_eps;
@@ -96,13 +96,15 @@ struct EpLearnArgs {
     // near: in standard deviations, the distance of the mode that does where sites are warm, and that of the nodes' mean from
     // their centre beyond which the window after begins about the mean
     double tol, tol_nodes, close, near, least, narrow;
-    int nodes, stage;                        // at most so many points, so many a stage
+    int nodes, light, stage;                 // at most so many points; those of a light window, first in z; so many a stage
     double usable;                           // disagreement of moments from which a point counts as not settled
     double enough;                           // doubt about the states, in standard deviations, that ends the stages
     const double* z;                         // (nodes, q): standard normal
     // found
     double *mode, *H, *phi, *log_weight;     // (q,), (q,q), (nodes,q), (nodes,)
     double* next;                            // (q,): the centre of nodes that the window after may begin with
+    double* doubt;                           // about the states, were the window after a light one
+    bool* tells;                             // whether there are nodes enough to tell a slope
     double *node_slope, *second;             // (nodes,q): d log Z / d phi at each node; (nodes,) what log Z lacks there
     double *value, *share, *residuals;       // (nodes,): log posterior, weight, disagreement of moments
     double *x, *P, *k3, *k4, *centre, *out;  // (T+1,n), (T+1,n,n), ...: of the mixture; out (rows,) or null
@@ -111,7 +113,7 @@ struct EpLearnArgs {
     long* sweeps_used;
     double *mean, *sd, *quantile_lo, *quantile_hi;           // (groups,), only the free ones written: half-widths, variances
     double *found_rate, *effective;                          // rate of outliers; effective number of nodes
-    double *told_pull, *told_precision, *told_power;         // (groups,), (groups,groups), (groups,): what the rows tell
+    double *told_pull, *told_precision, *told_power;         // (groups,), (groups,groups), (groups,): what the rows tell; or 0
     int columns;                                             // nodes in whole registers
     double *lanes, *lane_phi;  // (2 sites, columns): m and nu, then D and tau, of each; (columns, q) its parameters, or NaN
     bool* finite;                                            // whether x and P are

@@ -31,8 +31,10 @@ constexpr int ep_alone = 10;  // sweeps of a chain with its bounds alone, which 
 constexpr int ep_stages = 8;  // most stages of points
 constexpr double ep_lean = 4.0;  // points that a first guess of their covariance is worth
 constexpr double ep_wide = 1.15;  // by how much a stage reaches farther than the posterior is thought to
+constexpr double ep_least = 3.0;   // effective points without which nothing is to be trusted
 constexpr double ep_some = 10.0;  // effective points without which the evidence itself is in doubt
 constexpr int ep_few = 2;     // rows that may come or go while the mode stays
+constexpr int ep_never = 1 << 20; // of windows since a search: the next one searches
 constexpr double ep_sure = 0.25;  // standard deviations in which a step of Newton errs by no more than the mode may
 constexpr double ep_apart = 1.0;  // disagreement of moments, in standard deviations, beyond which no step is taken
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
@@ -533,18 +535,19 @@ struct EpLearner {
     };
     Stage stage[ep_stages] = {};
     int stages_used = 0;
+    bool light = false;
 
     // v, 0 at the mode, of a parameter
     double place_of(int j, double phi, double mode) const {
         return group[j] < 0 ? phi - mode : (std::exp(a.warp * (phi - mode)) - 1.0) / a.warp;
     }
     // from mean and covariance; couplings shrink until the factor exists
-    void plan(Stage& at, const double* m, const double (*S)[ep_free]) const {
+    void plan(Stage& at, const double* m, const double (*S)[ep_free], double wide = ep_wide) const {
         for (double keep = 1.0; !factor(S, keep, at.K); keep *= 0.7) {}
         at.log_det = 0.0;
         for (int j = 0; j < q; j++) {
             at.m[j] = m[j];
-            for (int i = 0; i <= j; i++) at.K[j][i] *= ep_wide;
+            for (int i = 0; i <= j; i++) at.K[j][i] *= wide;
             at.log_det += std::log(at.K[j][j]);
         }
     }
@@ -605,25 +608,32 @@ struct EpLearner {
             for (int j = 0; j < q; j++) S[i][j] += (1.0 - lean) * first[i][j];
         plan(stage[stages_used], m, S);
     }
-    // mean square over the states of what the choice of points leaves in doubt, in standard deviations: the share of the
-    // variance that lies between points, over their effective number
-    double doubt(int total, const double* share, double effective) const {
+    // mean over the states of the share of their variance that lies between points
+    double between(int total) const {
+        const double* share = a.share;
         const EpArgs& b = a.base;
         const std::ptrdiff_t size = stage_count();
         double all = 0.0;
         for (std::ptrdiff_t i = 0; i < size; i++) {
-            double mean = 0.0, within = 0.0, between = 0.0;
+            double mean = 0.0, within = 0.0, apart = 0.0;
             for (int k = 0; k < total; k++)
                 if (share[k] > 0.0) mean += share[k] * b.x[k * size + i];
             for (int k = 0; k < total; k++)
                 if (share[k] > 0.0) {
                     const double d = b.x[k * size + i] - mean;
-                    between += share[k] * d * d;
+                    apart += share[k] * d * d;
                     within += share[k] * max2(b.P[(k * size + i) * ep.n + i % ep.n], 0.0);
                 }
-            all += between / max2(between + within, 1e-300);
+            all += apart / max2(apart + within, 1e-300);
         }
-        return all / (size * effective);
+        return all / size;
+    }
+
+    // What a number of points leaves in doubt of the states, in standard deviations, by what `total` points found. A stage
+    // has the mean and the covariance of its law, so with even weights what is linear in s^warp would be exact: points err
+    // by as much as their weights are uneven.
+    double doubt(int total, double effective, int count) const {
+        return std::sqrt(between(total) * max2(total / effective - 1.0, 0.0) / count);
     }
 
     // weighted raw moments about `centre`
@@ -667,13 +677,14 @@ struct EpLearner {
     void evaluate_nodes(int k, int end, const Stage& now, const double* mode) {
         double at[wide_lanes][ep_free], value[wide_lanes], slope[wide_lanes][ep_free];
         bool inside[wide_lanes];
+        const int column = light ? k : k + a.light;
         for (int l = 0; l < wide_lanes; l++) {
             inside[l] = k + l < end;
             for (int j = 0; j < q; j++) at[l][j] = mode[j];
             if (now.count > 1 && inside[l]) {
                 for (int i = 0; i < q; i++) {
                     double v = now.m[i];
-                    for (int j = 0; j <= i; j++) v += now.K[i][j] * a.z[(k + l) * q + j];
+                    for (int j = 0; j <= i; j++) v += now.K[i][j] * a.z[(column + l) * q + j];
                     const double u = 1.0 + a.warp * v;  // s^warp over the mode's
                     at[l][i] = group[i] < 0 ? mode[i] + v : u > 0.0 ? mode[i] + std::log(u) / a.warp : lo[i] - 1.0;
                     if (at[l][i] > hi[i] || at[l][i] < lo[i]) inside[l] = false;
@@ -685,10 +696,10 @@ struct EpLearner {
         }
         ep.block = {k, k + wide_lanes - 1};
         if (outside) outside->block = ep.block;
-        const Begin begin = now.count > 1 && resume(k, at) ? resumed : led;
+        const Begin begin = now.count > 1 && resume(column, at) ? resumed : led;
         if (begin == led) recall(at);
         evaluate_inside(at, a.most, a.tol_nodes, value, slope, begin, false);
-        if (now.count > 1) hold(k, at);
+        if (now.count > 1) hold(column, at);
         const V more = ep.second(a.base.k3, a.base.k4);
         const V less = outside ? V(a.condition) * outside->second(nullptr, nullptr) : V(0.0);
         for (int l = 0; l < wide_lanes && k + l < end; l++) {
@@ -717,7 +728,7 @@ struct EpLearner {
             const double d = group[j] < 0 ? mean[j] : std::log(max2(1.0 + a.warp * mean[j], 0.1)) / a.warp;
             a.next[j] = near ? mode[j] : min2(max2(mode[j] + d, lo[j]), hi[j]);
         }
-        return effective > 3.0;
+        return effective > ep_least;
     }
 
     int run() {
@@ -756,12 +767,13 @@ struct EpLearner {
         double best = minus_inf;
         *a.log_prior = 0.0;
         int code = 0;
-        const bool again = q > 0 && warm && a.before->lanes && a.before->since < a.again && a.before->drop <= ep_few &&
-                           b.T - a.before->common <= ep_few;
+        const bool calm = a.light > 0 && warm && a.before->lanes && a.before->doubt < a.enough;  // a light window may do
+        const bool again = q > 0 && warm && a.before->lanes && a.before->since < (calm ? a.calm : a.again) &&
+                           a.before->drop <= ep_few && b.T - a.before->common <= ep_few;
         if (again) {  // about where the nodes of the window before were
             double d[ep_free];
             for (int j = 0; j < q; j++) {
-                phi[j] = min2(max2(a.before->mode[j], lo[j]), hi[j]);
+                phi[j] = min2(max2(a.before->centre[j], lo[j]), hi[j]);
                 for (int i = 0; i < q; i++) H[j][i] = a.before->H[j * q + i];
                 d[j] = phi[j] - kept[j];
             }
@@ -804,7 +816,8 @@ struct EpLearner {
             b.tau[k] = keep_tau[k];
             b.nu[k] = keep_nu[k];
         }
-        const int nodes = alone(H) ? 1 : a.nodes;
+        light = again && calm && !alone(H);
+        const int nodes = alone(H) ? 1 : light ? a.nodes : a.nodes - a.light;
         ep.cross = wanted;
         if (outside) outside->cross = around;
         const std::ptrdiff_t size = stage_count();
@@ -828,25 +841,30 @@ struct EpLearner {
                 }
             }
             const double none[ep_free] = {};
-            plan(stage[0], none, S);
+            plan(stage[0], none, S, light ? 1.0 : ep_wide);
         }
         int done = 0;
         double effective = 0.0, log_sum = 0.0;
         while (done < nodes) {
             Stage& now = stage[stages_used];
             const int from = done, left = nodes - done;
-            now.count = left < 2 * a.stage || stages_used == ep_stages - 1 ? left : a.stage;
+            now.count = light && done == 0 ? a.light : left < 2 * a.stage || stages_used == ep_stages - 1 ? left : a.stage;
             for (; done < from + now.count; done += wide_lanes) evaluate_nodes(done, from + now.count, now, phi);
             done = from + now.count;
             if (nodes > 1) stages_used++;
             effective = weigh(phi, done, a.share, &log_sum);
             if (done == nodes) break;
-            if (effective > ep_some && doubt(done, a.share, effective) < a.enough * a.enough) break;
+            // elsewhere half-widths are asked for as well, which want points enough even if those were drawn at random
+            const double least = light && done == a.light ? ep_least : ep_some;
+            const double left_open = calm ? doubt(done, effective, done) : std::sqrt(between(done) / effective);
+            if (effective > least && left_open < a.enough) break;
             if (effective > 0.0) refit(phi, done, a.share, effective, S);
             else stage[stages_used] = now;
         }
         *a.used = done;
         if (!(effective > 0.0)) return 2;
+        *a.tells = !light || done > a.light;
+        *a.doubt = a.light ? doubt(done, effective, a.light) : 0.0;
         ep.block = {0, wide_lanes - 1};
         int heaviest = 0;
         for (int k = 1; k < done; k++)
@@ -871,7 +889,7 @@ struct EpLearner {
         *a.log_evidence = log_sum + (nodes > 1 ? -std::log(static_cast<double>(done)) : 0.5 * q * log_2pi) - half_log_det;
         *a.sweeps_used = sweeps;
         *a.since = again ? a.before->since + 1 : 0;
-        if (!next_centre(done, phi, H, effective) || nodes == 1) *a.since = a.again;
+        if (!next_centre(done, phi, H, effective) || nodes == 1) *a.since = ep_never;
         return code;
     }
 };

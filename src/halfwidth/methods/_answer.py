@@ -183,6 +183,11 @@ class Answer:
         return Start(self.found["s"], self.handed)
 
     @property
+    def tells(self) -> bool:
+        """Whether there were nodes enough for `told`."""
+        return bool(self.found["tells"])
+
+    @property
     def told(self) -> Known:
         """What its rows tell of the half-widths."""
         return Known.of(self.found["told"])

@@ -11,7 +11,8 @@ of the posterior over s (the nodes of `Posterior`). A half-width that is well se
 one that drowns in other noise is felt through s^2 and leaves a parabola about 0. A quadratic in log s or s^(1/2) fits
 the first alone: early windows, whose posterior is wide, would make the second smaller than it is. A row lies in as
 many windows as a window has rows, N: each window counts 1 / N, and only once **all** of its rows have left, so no row
-speaks twice and the prior of the newest window holds none of its own data. The sum of overlapping window likelihoods
+speaks twice and the prior of the newest window holds none of its own data. A light window has too few nodes to tell a
+slope: the next that can speaks for it. The sum of overlapping window likelihoods
 is a composite likelihood: its slope has mean 0 at the truth as each window's own has. The sum fades by exp(-1 / rows)
 a row.
 
@@ -174,10 +175,12 @@ class Carried:
         self.fade = math.exp(-1.0 / rows)
         self.gone, self.kept_in = Known.none(p), Known.none(p)  # by windows that have left, and their bounds alone
         self.rows = 0.0  # rows that have left, faded
-        self.waiting: list[tuple[int, Known, Known]] = []  # newest row of a window, and both, weighted
+        # newest row of a window, both of its own, weighted, and for how many windows it speaks
+        self.waiting: list[tuple[int, Known, Known, int]] = []
         self.inside = Known.none(p)  # bounds alone of the last window asked
         self.given: Known | None = None  # what the newest window was told
-        self.count = 0  # windows that told something
+        self.count = 0  # windows, of those with a new row
+        self.unsaid = 0  # ... of which none has told anything yet
         self.start: Start | None = None
         self.first: Normal | None = None  # the state before the first row, once rows have left
         self.frames: dict[bytes, Frame] = {}
@@ -190,10 +193,10 @@ class Carried:
         kept_in *= self.fade
         self.rows *= self.fade
         while self.waiting and self.waiting[0][0] < first:
-            _, told, bounds = self.waiting.pop(0)
+            _, told, bounds, windows = self.waiting.pop(0)
             gone += told.values
             kept_in += bounds.values
-            self.rows += 1.0
+            self.rows += windows
         self.given = None
         if self.rows:
             self.given = Known.of(gone - condition(rows + self.rows) * (kept_in + self.inside.values))
@@ -218,15 +221,19 @@ class Carried:
         if self.count % rows == 0:
             self.inside = inside(answer.chain, self.start.s)
         self.count += 1
-        self.waiting.append((newest, answer.told.times(1.0 / rows), self.inside.times(1.0 / rows)))
+        self.unsaid += 1
+        if answer.tells:
+            share = self.unsaid / rows
+            self.waiting.append((newest, answer.told.times(share), self.inside.times(share), self.unsaid))
+            self.unsaid = 0
 
     def save(self) -> dict[str, Any]:
         """Return all of it as plain numbers."""
         start = self.start
         return {
             "gone": [_plain(self.gone), _plain(self.kept_in), _plain(self.inside), self.rows],
-            "waiting": [[k, _plain(told), _plain(inside)] for k, told, inside in self.waiting],
-            "count": self.count,
+            "waiting": [[k, _plain(told), _plain(inside), windows] for k, told, inside, windows in self.waiting],
+            "count": [self.count, self.unsaid],
             "s": None if start is None else start.s.tolist(),
             "before": None if start is None or start.before is None else _plain_handed(start.before),
             "first": None if self.first is None else [self.first.mean.tolist(), self.first.P.tolist()],
@@ -238,8 +245,8 @@ class Carried:
         *sums, rows = saved["gone"]
         self.gone, self.kept_in, self.inside = (_known(v) for v in sums)
         self.rows = float(rows)
-        self.waiting = [(int(k), _known(told), _known(inside)) for k, told, inside in saved["waiting"]]
-        self.count = int(saved["count"])
+        self.waiting = [(int(k), _known(told), _known(bounds), int(windows)) for k, told, bounds, windows in saved["waiting"]]
+        self.count, self.unsaid = map(int, saved["count"])
         self.start = None
         if saved["s"] is not None:
             before = None if saved["before"] is None else _handed(saved["before"])

@@ -49,8 +49,8 @@ from halfwidth.result import Estimate
 
 #: Power of the half-widths' prior; see above.
 POWER = 0.4
-#: Nodes of a stage, and most stages (core/ep_learn.hpp).
-_STAGE, _STAGES = 16, 8
+#: Nodes of a stage, and most stages; nodes of a light window (core/ep_learn.hpp).
+_STAGE, _STAGES, _LIGHT = 16, 8, 8
 #: Power of a half-width in which its posterior is nearly Gaussian: 0 is no tail there.
 WARP = 0.5
 #: Numbers that the beliefs of all nodes may take up; one stage is always had.
@@ -68,7 +68,7 @@ _LONG = 2000
 _FIRST = 2000
 _OF_LONG = {"few": 12, "many": 25, "most": 20, "steps": 30, "narrow": 0.15}
 #: A window takes over centre and nodes of the one before, where it would search for its mode, at most so often in a row
-#: and in an eighth of its rows.
+#: and in an eighth of its rows; light windows in a quarter of them.
 _AGAIN = 4
 #: With everything known there is time for more: at most so many sweeps, to this agreement of moments.
 _KNOWN = {"most": 200, "tol_nodes": 1e-7}
@@ -314,7 +314,7 @@ class Posterior:
         stages, q = len(frame.problem["start"]) - 1, frame.q + learn_rate
         limits = dict(_LIMITS)
         limits["condition"] = condition(stages - 1) if first else 0.0  # `known` sees to it
-        limits["again"] = min((stages - 1) // 8, _AGAIN)
+        limits["again"], limits["calm"] = min((stages - 1) // 8, _AGAIN), (stages - 1) // 4 if stages > 8 else 0
         rows = max(float(frame.count.sum()), 1.0)
         limits["tol"] = min(limits["tol"], 0.3 / math.sqrt(rows))
         limits["tol_nodes"] = min(limits["tol_nodes"], 0.1 / math.sqrt(rows))
@@ -329,9 +329,13 @@ class Posterior:
             limits |= _MIXED
         if exact:
             limits["most"] = 1
+        z = nodes(q, count)
+        limits["light"] = _LIGHT if 0 < q < _LIGHT <= count // 2 else 0
+        if limits["light"]:
+            z = np.concatenate([design(q), z])
         return _core.EpFrame(
             frame.problem, frame.free, frame.cap, frame.count, frame.fitted, learn_rate, rate,
-            math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, nodes(q, count), limits,
+            math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, z, limits,
             frame.outside if limits["condition"] > 0 else None,
         )  # fmt: skip
 
@@ -347,6 +351,16 @@ class Posterior:
         if self.outliers is True:
             return 0.01, True, _RATE
         return float(self.outliers), False, (1.0, 1.0)
+
+
+@functools.lru_cache(maxsize=8)
+def design(q: int) -> Array:
+    """Return the eight points (8, q), q < 8, of a light window: columns of a Hadamard matrix, of mean 0 and covariance 1.
+
+    As far as there are columns none is the product of two others.
+    """
+    two = np.array([[1.0, 1.0], [1.0, -1.0]])
+    return np.ascontiguousarray(np.kron(two, np.kron(two, two))[:, [1, 2, 4, 7, 3, 5, 6][:q]])
 
 
 @functools.lru_cache(maxsize=64)
