@@ -188,10 +188,10 @@ class Carried:
 
     def known(self, first: int, rows: int) -> Known | None:
         """Return what the windows tell that have no row from `first` on, for one of so many rows; None: nothing."""
-        gone, kept_in = self.gone.values, self.kept_in.values
-        gone *= self.fade
-        kept_in *= self.fade
-        self.rows *= self.fade
+        gone, kept_in, fade = self.gone.values, self.kept_in.values, self.fade
+        gone *= fade
+        kept_in *= fade
+        self.rows *= fade
         while self.waiting and self.waiting[0][0] < first:
             _, told, bounds, windows = self.waiting.pop(0)
             gone += told.values
