@@ -245,7 +245,9 @@ class Carried:
         *sums, rows = saved["gone"]
         self.gone, self.kept_in, self.inside = (_known(v) for v in sums)
         self.rows = float(rows)
-        self.waiting = [(int(k), _known(told), _known(bounds), int(windows)) for k, told, bounds, windows in saved["waiting"]]
+        self.waiting = [
+            (int(k), _known(told), _known(bounds), int(windows)) for k, told, bounds, windows in saved["waiting"]
+        ]
         self.count, self.unsaid = map(int, saved["count"])
         self.start = None
         if saved["s"] is not None:
