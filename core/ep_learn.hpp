@@ -41,7 +41,7 @@ constexpr double ep_least = 3.0;   // effective points without which nothing is 
 constexpr double ep_some = 10.0;  // effective points without which the evidence itself is in doubt
 constexpr int ep_few = 2;     // rows that may come or go while the mode stays
 constexpr int ep_never = 1 << 20; // of windows since a search: the next one searches
-constexpr double ep_sure = 0.5;   // standard deviations in which a step of Newton errs by no more than the mode may
+constexpr double ep_sure = 0.25;  // standard deviations in which a step of Newton errs by no more than the mode may
 constexpr double ep_apart = 1.0;  // disagreement of moments, in standard deviations, beyond which no step is taken
 constexpr double ep_near = 0.05;  // how near the mode must be where it stands alone for the parameters
 

@@ -59,7 +59,7 @@ _ROOM = 4e6
 #: Of the search and the nodes. A window's nodes lie about the centre that the window before handed on: its own, or the
 #: mean of its nodes where that lies further off than `near`, in standard deviations.
 _LIMITS = {
-    "steps": 14, "few": 2, "many": 4, "most": 5, "tol": 2e-2, "tol_nodes": 2e-2, "close": 0.05, "near": 0.8,
+    "steps": 14, "few": 2, "many": 6, "most": 5, "tol": 2e-2, "tol_nodes": 2e-2, "close": 0.05, "near": 0.8,
     "least": 2.0, "narrow": 0.03, "damping": 0.7, "warp": WARP, "reference": 1.0,
     "stage": _STAGE, "enough": 0.06, "usable": 0.1,
 }  # fmt: skip
