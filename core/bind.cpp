@@ -19,6 +19,7 @@ void bind_hull(nb::module_& m);
 void bind_constrain(nb::module_& m);
 void bind_noise(nb::module_& m);
 void bind_ep(nb::module_& m);
+void bind_ep_learn(nb::module_& m);
 void bind_window(nb::module_& m);
 void bind_sampler(nb::module_& m);
 void bind_mixed(nb::module_& m);
@@ -43,6 +44,7 @@ NB_MODULE(_core, m) {
     bind_constrain(m);
     bind_noise(m);
     bind_ep(m);
+    bind_ep_learn(m);
     bind_window(m);
     bind_sampler(m);
     bind_mixed(m);

@@ -6,6 +6,7 @@
 
 #include <cstdint>
 #include <cstdlib>
+#include <cstring>
 #include <initializer_list>
 #include <new>
 
@@ -39,5 +40,17 @@ struct Fresh {
         array = nb::cast(nb::ndarray<nb::numpy, double>(a, d, s, owner));
     }
 };
+
+// A fresh array of zeros, or of what `from` holds; its memory to `data`.
+template <class T>
+nb::object fresh(std::initializer_list<std::size_t> shape, T** data, const T* from = nullptr) {
+    std::size_t count = 1;
+    for (std::size_t s : shape) count *= s;
+    T* p = new T[count > 0 ? count : 1]();
+    if (from && count) std::memcpy(p, from, count * sizeof(T));
+    nb::capsule owner(p, [](void* q) noexcept { delete[] static_cast<T*>(q); });
+    *data = p;
+    return nb::cast(nb::ndarray<nb::numpy, T>(p, shape, owner));
+}
 
 }  // namespace

@@ -6,6 +6,7 @@
 #include <memory>
 #include <stdexcept>
 
+#include "bind_array.hpp"
 #include "chain_entry.hpp"
 
 namespace nb = nanobind;
@@ -14,16 +15,6 @@ using namespace nb::literals;
 namespace {
 
 using Array = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
-
-nb::object fresh(std::initializer_list<std::size_t> shape, double** data, const double* from = nullptr) {
-    std::size_t count = 1;
-    for (std::size_t s : shape) count *= s;
-    double* p = new double[count > 0 ? count : 1]();
-    if (from && count) std::memcpy(p, from, count * sizeof(double));
-    nb::capsule owner(p, [](void* q) noexcept { delete[] static_cast<double*>(q); });
-    *data = p;
-    return nb::cast(nb::ndarray<nb::numpy, double>(p, shape, owner));
-}
 
 nb::tuple chain_solve(Array M, Array O, Array B, Array K, Array f, Array k, bool inverse, double drop) {
     if (M.ndim() != 3 || B.ndim() != 3 || f.ndim() != 2 || M.shape(0) < 1)

@@ -6,6 +6,7 @@
 #include <memory>
 #include <stdexcept>
 
+#include "bind_array.hpp"
 #include "constrain_entry.hpp"
 
 namespace nb = nanobind;
@@ -14,17 +15,6 @@ using namespace nb::literals;
 namespace {
 
 using Array = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
-
-template <class T>
-nb::object fresh(std::initializer_list<std::size_t> shape, T** data, const T* from = nullptr) {
-    std::size_t count = 1;
-    for (std::size_t s : shape) count *= s;
-    T* p = new T[count > 0 ? count : 1]();
-    if (from && count) std::memcpy(p, from, count * sizeof(T));
-    nb::capsule owner(p, [](void* q) noexcept { delete[] static_cast<T*>(q); });
-    *data = p;
-    return nb::cast(nb::ndarray<nb::numpy, T>(p, shape, owner));
-}
 
 nb::tuple constrain_run(int by, Array x, Array P, Array D, Array lo, Array hi) {
     if (x.ndim() != 2 || P.ndim() != 3 || D.ndim() != 2 || by < 0 || by > hw::constrain_by_nearest)

@@ -10,6 +10,7 @@
 #include <optional>
 #include <stdexcept>
 
+#include "bind_array.hpp"
 #include "hull_entry.hpp"
 
 namespace nb = nanobind;
@@ -43,16 +44,6 @@ thread_local Scratch scratch;
 
 void need(bool ok, const char* what) {
     if (!ok) throw std::invalid_argument(what);
-}
-
-nb::object fresh(std::initializer_list<std::size_t> shape, double** data, const double* from = nullptr) {
-    std::size_t count = 1;
-    for (std::size_t s : shape) count *= s;
-    double* p = new double[count > 0 ? count : 1]();
-    if (from && count) std::memcpy(p, from, count * sizeof(double));
-    nb::capsule owner(p, [](void* q) noexcept { delete[] static_cast<double*>(q); });
-    *data = p;
-    return nb::cast(nb::ndarray<nb::numpy, double>(p, shape, owner));
 }
 
 // The rows of a record or window from the arrays that state them.

@@ -13,6 +13,7 @@
 #include <tuple>
 #include <vector>
 
+#include "bind_array.hpp"
 #include "lp.hpp"
 
 namespace nb = nanobind;
@@ -54,15 +55,6 @@ class Scratch {
     std::size_t size_ = 0;
 };
 thread_local Scratch scratch;
-
-nb::object fresh(std::initializer_list<std::size_t> shape, double** data) {
-    std::size_t count = 1;
-    for (std::size_t s : shape) count *= s;
-    double* p = new double[count > 0 ? count : 1]();
-    nb::capsule owner(p, [](void* q) noexcept { delete[] static_cast<double*>(q); });
-    *data = p;
-    return nb::cast(nb::ndarray<nb::numpy, double>(p, shape, owner));
-}
 
 void need(bool ok, const char* what) {
     if (!ok) throw std::invalid_argument(what);

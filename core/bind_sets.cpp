@@ -8,6 +8,7 @@
 #include <memory>
 #include <string>
 
+#include "bind_array.hpp"
 #include "bind_box.hpp"
 #include "sets_entry.hpp"
 
@@ -38,15 +39,6 @@ hw::SetSizes sizes(const std::string& kind, std::size_t n, std::size_t m, int ge
     z.constraints = constraints;
     z.rounds = rounds;
     return z;
-}
-
-nb::object fresh(std::initializer_list<std::size_t> shape, double** data) {
-    std::size_t count = 1;
-    for (std::size_t s : shape) count *= s;
-    double* p = new double[count > 0 ? count : 1]();
-    nb::capsule owner(p, [](void* q) noexcept { delete[] static_cast<double*>(q); });
-    *data = p;
-    return nb::cast(nb::ndarray<nb::numpy, double>(p, shape, owner));
 }
 
 nb::object set_start(const std::string& kind, int n, int m, int generators, int constraints) {

@@ -238,7 +238,7 @@ int ep_learn(const EpLearnArgs& given) {
         for (int i = 0; i < a.base.n; i++)
             if (a.base.group_Q[i] == g) own[i] = s * s;
     }
-    ep_edge(a.base, own, a.base.m, a.base.D, a.base.tau, a.base.nu, a.edge_x, a.edge_P, rest);
+    ep_edge(a.base, own, a.base.m, a.base.D, a.base.tau, a.base.nu, a.held->edge_x, a.held->edge_P, rest);
     return code;
 }
 

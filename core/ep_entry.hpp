@@ -61,17 +61,22 @@ struct EpArgs {
     double* work;                  // ep_workspace doubles, on a 32-byte boundary
 };
 
-// Sites of the window before, of its mode and of every lane that was evaluated; see core/ep_handover.hpp.
-struct EpBefore {
-    int stages, drop;                 // of it; how many rows later the new one begins
+// What a solved window hands on; see core/ep_handover.hpp.
+struct EpHeld {
+    int stages;
     const std::int32_t* start;        // (stages+1,)
-    const double *m, *D, *tau, *nu;   // (stages,n), (start[stages],)
-    const double *lanes, *lane_phi;   // as those of EpLearnArgs, of as many columns; or null. With them:
-    const double *centre, *H;         // (q,), (q,q): of its nodes
-    double log_mode, log_prior, doubt;
+    double *m, *D, *tau, *nu;         // (stages,n), (start[stages],): sites of its mode
+    double *lanes, *lane_phi;         // (2 sites, columns): m and nu, then D and tau, of each lane; (columns, q) its parameters, or NaN
+    double *centre, *H;               // (q,), (q,q): of the nodes that the window after may begin with
+    double *edge_x, *edge_P;          // (stages,n), (stages,n,n): x_t given what lies up to t
+    double log_mode, log_prior;       // Z times prior, and the prior, at the mode
+    double doubt;                     // about the states, were the window after a light one
     int since;                        // windows since the mode was searched for
-    // rows that both hold: found by `ep_shift`
-    int common, low, high, there;     // stages but the first; rows here, and the first of them there
+};
+// The window before as the next one finds it, which begins `drop` rows later.
+struct EpBefore : EpHeld {
+    int drop;                         // lanes are null where there are others
+    int common, low, high, there;     // found by `ep_shift`: stages but the first that both hold; rows here, the first of them there
 };
 
 // Half-widths and the rate of outliers found by evidence; see core/ep_learn.hpp. `base` has a member for each node, up to a
@@ -102,23 +107,19 @@ struct EpLearnArgs {
     const double* z;                         // (nodes, q): standard normal
     // found
     double *mode, *H, *phi, *log_weight;     // (q,), (q,q), (nodes,q), (nodes,)
-    double* next;                            // (q,): the centre of nodes that the window after may begin with
-    double* doubt;                           // about the states, were the window after a light one
     bool* tells;                             // whether there are nodes enough to tell a slope
     double *node_slope, *second;             // (nodes,q): d log Z / d phi at each node; (nodes,) what log Z lacks there
     double *value, *share, *residuals;       // (nodes,): log posterior, weight, disagreement of moments
     double *x, *P, *k3, *k4, *centre, *out;  // (T+1,n), (T+1,n,n), ...: of the mixture; out (rows,) or null
-    double *log_evidence, *log_mode, *log_prior, *residual;  // of the data; Z times prior, and the prior, at the mode
+    double *log_evidence, *residual;         // of the data
     std::int32_t* used;                      // nodes
     long* sweeps_used;
     double *mean, *sd, *quantile_lo, *quantile_hi;           // (groups,), only the free ones written: half-widths, variances
     double *found_rate, *effective;                          // rate of outliers; effective number of nodes
     double *told_pull, *told_precision, *told_power;         // (groups,), (groups,groups), (groups,): what the rows tell; or 0
     int columns;                                             // nodes in whole registers
-    double *lanes, *lane_phi;  // (2 sites, columns): m and nu, then D and tau, of each; (columns, q) its parameters, or NaN
     bool* finite;                                            // whether x and P are
-    int* since;                                              // windows since the mode was searched for
-    double *edge_x, *edge_P;                                 // (T+1,n), (T+1,n,n): x_t given what lies up to t
+    EpHeld* held;                                            // for the window after; its sites are those of the base
 };
 
 }  // namespace hw

@@ -290,7 +290,7 @@ inline void ep_told(const EpLearnArgs& a, int q, double* work) {
             for (int j = 0; j < f; j++) pull[i] += H[i * f + j] * s[j];
         }
     } else {
-        if (sound < f + 2) return;
+        if (sound < 2 * f + 2) return;  // so few would be gone through, not averaged
         constexpr double flatter[4] = {1.0, 0.5, 0.25, 0.0};
         for (const double flat : flatter)  // few nodes carry the weight: they alone cannot tell a slope
             if (ep_weights(K, a.log_weight, keep, flat, w) > 2.0 * f + 2.0) break;

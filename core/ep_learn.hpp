@@ -10,8 +10,14 @@
 // covariance H^-1, each later one with the weighted moments of all points so far. A point's weight is its evidence over
 // the mixture of all stages' Gaussians (adaptive multiple importance sampling, Cornuet et al. 2012), the answer the points'
 // mixture; no more stages are asked for once their number leaves less than `enough` standard deviations in doubt. The
-// evidence of a point is that of expectation propagation and what that lacks to second order (Ep::second). A half-width
-// that may as well be 0 has an exponential tail in log s and none in a power of s, so the search and the nodes live in u =
+// evidence of a point is that of expectation propagation and what that lacks to second order (Ep::second).
+//
+// In a stream the mode is searched for now and then only, and the nodes of the windows between lie about the same centre. Where
+// the window before leaves little in doubt, a window between is light: its first stage is a design of its own, the first rows
+// of z, with mean 0 and covariance 1. No more points are asked for unless it leaves more in doubt than was expected, and it
+// tells later windows nothing (`tells`): that takes a regression.
+//
+// A half-width that may as well be 0 has an exponential tail in log s and none in a power of s, so the search and the nodes live in u =
 // s^warp (its density has the prior s^(a-warp) in log s, and at its mode the two Hessians differ by du/dphi only). Sites
 // follow phi from point to point, so a point costs few sweeps.
 //
@@ -293,12 +299,12 @@ struct EpLearner {
         for (std::ptrdiff_t site = 0; site < sites; site++) {
             const V first = site < stages ? ep.s.m[site] : ep.s.nu[site - stages];
             const V second = site < stages ? ep.s.D[site] : ep.s.tau[site - stages];
-            double* p = a.lanes + site * a.columns + column;
+            double* p = a.held->lanes + site * a.columns + column;
             __builtin_memcpy(p, &first, sizeof first);
             __builtin_memcpy(p + sites * a.columns, &second, sizeof second);
         }
         for (int l = 0; l < wide_lanes; l++)
-            for (int j = 0; j < q; j++) a.lane_phi[(column + l) * q + j] = Ep<N>::alive(f, l) ? phi[l][j] : __builtin_nan("");
+            for (int j = 0; j < q; j++) a.held->lane_phi[(column + l) * q + j] = Ep<N>::alive(f, l) ? phi[l][j] : __builtin_nan("");
     }
 
     // evaluate the lanes; value[l] = log posterior up to a constant, slope[l][j]
@@ -431,7 +437,7 @@ struct EpLearner {
     void go(double* phi, const double* d, const double* g, double* best) {
         for (int j = 0; j < q; j++) {
             const double told_slope = group[j] >= 0 ? 2.0 * a.reference * (1.0 - told(j, 0)) : 0.0;
-            *a.log_prior += (prior_slope(j, phi) + told_slope) * d[j];
+            a.held->log_prior += (prior_slope(j, phi) + told_slope) * d[j];
             *best += 0.5 * g[j] * d[j];
             phi[j] += d[j];
         }
@@ -495,7 +501,7 @@ struct EpLearner {
             refused = 0;
             *best = value[0];
             kept_value = value[0] - log_told(0);
-            *a.log_prior = log_prior(trial, 0);
+            a.held->log_prior = log_prior(trial, 0);
             for (int j = 0; j < q; j++) {
                 phi[j] = trial[j];
                 g[j] = slope[0][j] + (group[j] >= 0 ? 2.0 * a.reference * (1.0 - told(j, 0)) : 0.0);
@@ -726,7 +732,7 @@ struct EpLearner {
         }
         for (int j = 0; j < q; j++) {
             const double d = group[j] < 0 ? mean[j] : std::log(max2(1.0 + a.warp * mean[j], 0.1)) / a.warp;
-            a.next[j] = near ? mode[j] : min2(max2(mode[j] + d, lo[j]), hi[j]);
+            a.held->centre[j] = near ? mode[j] : min2(max2(mode[j] + d, lo[j]), hi[j]);
         }
         return effective > ep_least;
     }
@@ -747,7 +753,7 @@ struct EpLearner {
             ep.s.eps.set(l, a.rate);
             put(l, phi);
         }
-        for (int k = 0; k < a.columns * q; k++) a.lane_phi[k] = __builtin_nan("");
+        for (int k = 0; k < a.columns * q; k++) a.held->lane_phi[k] = __builtin_nan("");
         const bool warm = b.warm;
         if (warm) {
             double from[ep_free];
@@ -765,7 +771,7 @@ struct EpLearner {
         const EpCross wanted = ep.cross;
         ep.cross = EpCross{};
         double best = minus_inf;
-        *a.log_prior = 0.0;
+        a.held->log_prior = 0.0;
         int code = 0;
         const bool calm = a.light > 0 && warm && a.before->lanes && a.before->doubt < a.enough;  // a light window may do
         const bool again = q > 0 && warm && a.before->lanes && a.before->since < (calm ? a.calm : a.again) &&
@@ -779,7 +785,7 @@ struct EpLearner {
             }
             draw(d);
             best = a.before->log_mode;  // in log s already
-            *a.log_prior = a.before->log_prior;
+            a.held->log_prior = a.before->log_prior;
         } else if (q > 0) {
             // far from the mode the evidence of the bounds alone misleads: first without it
             Ep<N>* const bounds = outside;
@@ -804,8 +810,8 @@ struct EpLearner {
         if (q > 0)
             for (double keep = 1.0; !factor(H, keep, L); keep *= 0.7) {}
         for (int j = 0; j < q; j++) {
-            a.mode[j] = a.next[j] = phi[j];
-            for (int i = 0; i < q; i++) a.H[j * q + i] = H[j][i];
+            a.mode[j] = a.held->centre[j] = phi[j];
+            for (int i = 0; i < q; i++) a.H[j * q + i] = a.held->H[j * q + i] = H[j][i];
         }
         // sites of the mode, for a warm start
         for (std::ptrdiff_t k = 0; k < stage_count(); k++) {
@@ -864,7 +870,7 @@ struct EpLearner {
         *a.used = done;
         if (!(effective > 0.0)) return 2;
         *a.tells = !light || done > a.light;
-        *a.doubt = a.light ? doubt(done, effective, a.light) : 0.0;
+        a.held->doubt = a.light ? doubt(done, effective, a.light) : 0.0;
         ep.block = {0, wide_lanes - 1};
         int heaviest = 0;
         for (int k = 1; k < done; k++)
@@ -882,14 +888,14 @@ struct EpLearner {
             const double to_phi = group[j] >= 0 ? a.warp * phi[j] : 0.0;
             half_log_det += (nodes > 1 ? -std::log(stage[0].K[j][j]) : std::log(L[j][j])) - to_phi;
             if (again) continue;
-            *a.log_prior += to_phi;
+            a.held->log_prior += to_phi;
             best += to_phi;
         }
-        *a.log_mode = best;
+        a.held->log_mode = best;
         *a.log_evidence = log_sum + (nodes > 1 ? -std::log(static_cast<double>(done)) : 0.5 * q * log_2pi) - half_log_det;
         *a.sweeps_used = sweeps;
-        *a.since = again ? a.before->since + 1 : 0;
-        if (!next_centre(done, phi, H, effective) || nodes == 1) *a.since = ep_never;
+        a.held->since = again ? a.before->since + 1 : 0;
+        if (!next_centre(done, phi, H, effective) || nodes == 1) a.held->since = ep_never;
         return code;
     }
 };

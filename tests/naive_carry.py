@@ -45,7 +45,7 @@ def told(free, found, before=None):
     else:
         sound = np.isfinite(log_weight) & np.isfinite(g).all(axis=1)
         s, g, log_weight, second = s[sound], g[sound], log_weight[sound], found["second"][:K][sound]
-        if len(s) < q + 2:
+        if len(s) < 2 * q + 2:
             return pull, precision, power
         for flat in (1.0, 0.5, 0.25, 0.0):
             w = np.exp(flat * (log_weight - log_weight.max()))

@@ -1,5 +1,7 @@
 """What `Window(Posterior())` hands on when rows leave: the state at its edge, and what is known of half-widths."""
 
+import math
+
 import halfwidth._core as _core
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from tests import naive_carry
 import halfwidth as hw
 from halfwidth.methods._carry import Carried, Known, Start, inside
 from halfwidth.methods._sites import sites
+from halfwidth.methods.posterior import design
 
 A = np.array([[1, -0.5, 0.2], [0.5, 0.1, 0], [0.3, 0, -0.1]])
 C = np.array([[1, 0, 0.5], [0, 1, 0.5]])
@@ -214,6 +217,67 @@ def test_nodes_that_are_taken_over_are_as_good_as_fresh_ones():
         fresh = _core.ep_run(answer.chain.problem, s, np.zeros(len(s)), 200, 1e-9, 1.0, None)
         np.testing.assert_allclose(found["slope"][sound], fresh["slope"][:, :5], atol=0.1)
     assert 1 in since
+
+
+def test_a_light_window_is_as_good_as_many_nodes_and_tells_nothing():
+    _, record = drawn(60, 12)
+    model = system(UNKNOWN, UNKNOWN, bounds=BOX)
+    known = Known(300.0 * np.ones(5), np.diag(300.0 / TRUE), np.zeros(5))  # of rows before
+    start, light = None, []
+    for first in range(16):
+        part = hw.Record(record.t[first : first + 33], record.y[first : first + 33])
+        answer = hw.Posterior().answer(model, part, start=start, drop=1, known=known)
+        start = answer.start
+        found = answer.found
+        if answer.tells:
+            light.append(0)
+            continue
+        light.append(1)
+        assert found["nodes"] == 8
+        assert not answer.told.values.any()
+        whole = hw.Posterior(nodes=128).answer(model, part, start=Start(start.s), known=known)
+        assert whole.tells
+        sd = whole.estimate.spread.sd
+        assert np.sqrt(np.mean(((answer.estimate.x - whole.estimate.x) / sd) ** 2)) < 0.06
+        assert np.sqrt(np.mean((answer.estimate.spread.sd / sd - 1.0) ** 2)) < 0.04
+        np.testing.assert_allclose(answer.widths[0], whole.widths[0], rtol=0.1)
+    # an eighth of the rows would be 4 in a row: a light one lasts for a quarter
+    assert light[0] == 0
+    assert 8 in [len(run) for run in "".join(map(str, light)).split("0")]
+
+
+def test_windows_are_not_light_where_half_widths_are_in_doubt():
+    _, record = drawn(60, 12)
+    model = system(UNKNOWN, UNKNOWN, bounds=BOX)
+    weak, start = Known(np.ones(5), np.diag(1.0 / TRUE), np.zeros(5)), None
+    for first in range(6):
+        part = hw.Record(record.t[first : first + 33], record.y[first : first + 33])
+        answer = hw.Posterior().answer(model, part, start=start, drop=1, known=weak)
+        start = answer.start
+        assert answer.tells
+        assert answer.found["nodes"] >= 16
+
+
+def test_the_window_that_tells_speaks_for_those_that_do_not():
+    _, record = drawn(400, 9)
+    model = system(UNKNOWN, UNKNOWN, bounds=BOX)
+    live = hw.stream(model, hw.Window(hw.Posterior(nodes=16), memory=18))
+    carried = live._core._rows.carried
+    for y in record.y:
+        live.push(y)
+    spoken = [windows for *_, windows in carried.waiting]
+    assert max(spoken) > 1
+    assert sum(spoken) + carried.unsaid == pytest.approx(19, abs=max(spoken))  # windows whose rows are still there
+    fade = math.exp(-1.0 / (live.method.recall * 19))
+    left = sum(fade**k for k in range(400 - 19))
+    assert carried.rows == pytest.approx(left, rel=0.03)
+
+
+def test_the_points_of_a_light_window_are_a_design():
+    for q in range(1, 8):
+        z = design(q)
+        np.testing.assert_array_equal(z.sum(axis=0), 0.0)
+        np.testing.assert_array_equal(z.T @ z, 8.0 * np.eye(q))
 
 
 @pytest.mark.parametrize("memory", [6, 18])

@@ -188,10 +188,10 @@ class Carried:
 
     def known(self, first: int, rows: int) -> Known | None:
         """Return what the windows tell that have no row from `first` on, for one of so many rows; None: nothing."""
-        gone, kept_in = self.gone.values, self.kept_in.values
-        gone *= self.fade
-        kept_in *= self.fade
-        self.rows *= self.fade
+        gone, kept_in, fade = self.gone.values, self.kept_in.values, self.fade
+        gone *= fade
+        kept_in *= fade
+        self.rows *= fade
         while self.waiting and self.waiting[0][0] < first:
             _, told, bounds, windows = self.waiting.pop(0)
             gone += told.values
@@ -245,7 +245,9 @@ class Carried:
         *sums, rows = saved["gone"]
         self.gone, self.kept_in, self.inside = (_known(v) for v in sums)
         self.rows = float(rows)
-        self.waiting = [(int(k), _known(told), _known(bounds), int(windows)) for k, told, bounds, windows in saved["waiting"]]
+        self.waiting = [
+            (int(k), _known(told), _known(bounds), int(windows)) for k, told, bounds, windows in saved["waiting"]
+        ]
         self.count, self.unsaid = map(int, saved["count"])
         self.start = None
         if saved["s"] is not None:
