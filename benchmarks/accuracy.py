@@ -138,15 +138,21 @@ def beside(log, begins, length, methods, times, silent):
     return found
 
 
+def overlap(start, length):
+    """Return the share (n, n) of stretches of one length that each has in common with each other."""
+    return np.clip(1.0 - np.abs(start[:, None] - start) / length, 0.0, None)
+
+
 def ratio(own, other, weight, alike):
     """Return the ratio of two means and the standard error of that from the differences, start by start.
 
-    What two starts tell is alike by the share (n, n) of their stretches that is the same (Newey and West 1987).
+    What two starts tell is alike by the share (n, n) of their stretches that is the same, `overlap` (Newey and West
+    1987).
     """
     a, b, n = np.average(own, weights=weight), np.average(other, weights=weight), len(weight)
     apart = weight / weight.sum() * n * (own - a / b * other)
     left = n * n - alike.sum()  # differences from a mean of their own are smaller than those from the true one
-    return a / b, np.sqrt(apart @ alike @ apart / left) / b if left > 0 else float("nan")
+    return a / b, np.sqrt(max(apart @ alike @ apart, 0.0) / left) / b if left > 0 else float("nan")
 
 
 def others_best(errors, weight):
@@ -175,7 +181,7 @@ def compared(log, found, lengths, most, methods, silent, every=1):
         if not one.start:
             continue
         n, start = np.array(one.count, dtype=float), np.array(one.start)
-        same, once = np.clip(1.0 - np.abs(start[:, None] - start) / length, 0.0, None), np.ones(len(start))
+        same, once = overlap(start, length), np.ones(len(start))
         means = {name: np.array(v) for name, v in one.means.items()}
         maxima = {name: np.array(v) for name, v in one.maxima.items()}
         own, top = means.pop(FILL), maxima.pop(FILL)
