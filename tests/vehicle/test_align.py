@@ -100,7 +100,7 @@ def test_a_clock_that_steps_is_found(late):
         speed_mps=speed,
         yaw_rate_radps=yaw,
     )
-    then = judged(stepped, distrust=False)
+    then = judged(stepped)
     found = then.sensors
     for name in ("speed", "yaw_rate"):
         one = found.offsets[name]
@@ -145,7 +145,7 @@ def test_a_clock_that_drifts_is_found():
     _, log = simulate_drive(seed=3, clock_offset=0.1, **CLEAN | {"duration": 1500.0})
     moved = log.stream("speed_mps")[0] * 2.4e-4  # 0.36 s in 25 minutes
     speed = np.interp(log.t - moved, log.t, log.speed_mps)
-    then = judged(replace(log, speed_mps=speed), distrust=False)
+    then = judged(replace(log, speed_mps=speed))
     found = then.sensors
     one = found.offsets["speed"]
     assert one.change == "drift"

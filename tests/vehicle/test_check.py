@@ -9,7 +9,7 @@ import pytest
 from tests.vehicle.drives import drive, save
 
 import halfwidth as hw
-from halfwidth.vehicle import check, fill, simulate_drive
+from halfwidth.vehicle import Log, check, fill, simulate_drive
 from halfwidth.vehicle.align import quantisation
 
 
@@ -234,3 +234,11 @@ def test_what_fill_was_told_is_no_finding():
     _, log = simulate_drive(duration=100.0, seed=4, tunnels=(20.0,))
     assert fill(log, clock_offset=0.0).found is None
     assert fill(log, distrust=False).found is None
+
+
+def test_a_log_without_a_fix_is_judged_by_what_its_sensors_say():
+    nothing = [float("nan")] * 20
+    found = check(Log(t=range(20), lat_deg=nothing, lon_deg=nothing, speed_mps=[1.0] * 20, yaw_rate_radps=[0.1] * 20))
+    assert found["streams"].verdict == "bad"
+    assert found["standstill"].verdict == "ok"
+    assert found["stray fixes"].verdict == "not checked"

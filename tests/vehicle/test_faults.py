@@ -90,8 +90,9 @@ def test_wrong_first_fixes_after_a_gap_do_not_bend_it(drive, clean, seconds, eas
     assert said(track, "where the vehicle cannot have been")
     assert in_gaps(truth, track) < 2 * clean + 0.5
     then = judged(wrong)
-    found = then.stray
-    times = then.grid.t[found.at]
+    grid = sampled(then.log, sensors=then.sensors)
+    found = strays(grid, then.sensors)
+    times = grid.t[found.at]
     for _, last in GAPS:
         near = (times > last) & (times < last + seconds + 1)
         assert near.any()

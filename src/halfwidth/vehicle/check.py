@@ -219,7 +219,7 @@ def check(log: Any, found: Findings | None = None) -> Check:
         else:
             then = judged(azimuth_put_right(believed)[0]) if found is None else found.judged
             basis = Basis(then.log, log, then.sensors, then.stamps, doubted)
-            moving += [trust, _stamps(believed, then.stamps), *check_sensors.items(then)]
+            moving += [trust, _stamps(believed, then.stamps), *check_sensors.items(then, found)]
     items = (
         _streams(log),
         _rates(log),

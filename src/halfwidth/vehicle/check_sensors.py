@@ -12,10 +12,12 @@ import numpy as np
 
 from halfwidth.vehicle import adrift
 from halfwidth.vehicle.align import EDGE
-from halfwidth.vehicle.judged import Judged, Sensed
+from halfwidth.vehicle.grid import sampled
+from halfwidth.vehicle.judged import Findings, Judged, Sensed
 from halfwidth.vehicle.lapse import words
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.sensors import STREAM, Calibration, Offset
+from halfwidth.vehicle.stray import strays
 
 #: The points, in order.
 NAMES = (
@@ -115,19 +117,21 @@ def lapsing(first: Sensed) -> Item:
     return Item("lapses", "bad", said, float(len(first.lapses)), line=fill_line(first.clocked))
 
 
-def items(found: Judged) -> list[Item]:
+def items(judged: Judged, found: Findings | None = None) -> list[Item]:
     """Give a verdict on each point.
 
     Parameters
     ----------
-    found : Judged
+    judged : Judged
+    found : Findings, optional
+        What `fill` found in this log.
 
     Returns
     -------
     list of Item
         In the order of `NAMES`.
     """
-    log, known = found.log, found.sensors
+    log, known = judged.log, judged.sensors
     return [
         *(_clock(log, known, name) for name in STREAM),
         _scale(log, known),
@@ -136,7 +140,7 @@ def items(found: Judged) -> list[Item]:
         _standstill(log, known),
         _slip(known),
         _fix_error(known),
-        _strays(found),
+        _strays(judged, found),
     ]
 
 
@@ -241,17 +245,18 @@ def _fix_error(known: Calibration) -> Item:
     return Item("fix error", "ok", text, quick, "m", evidence=dict(known.noise))
 
 
-def _strays(judged: Judged) -> Item:
-    known, found = judged.sensors, judged.stray
-    if found is None or not known.noise or not {"speed", "yaw_rate"} <= set(known.offsets):
+def _strays(judged: Judged, found: Findings | None) -> Item:
+    log, known = judged.log, judged.sensors
+    if not known.noise or not {"speed", "yaw_rate"} <= set(known.offsets):
         return Item("stray fixes", "not checked", "it needs speed, yaw rate and fixes that agree with them")
-    line = fill_line(judged.log)
-    grid = replace(judged.grid, t=judged.stamps.back(judged.grid.t))
-    if not found.at.size:
+    grid = sampled(log, sensors=known) if found is None else found.grid
+    stray = strays(grid, known) if found is None else found.stray
+    grid = replace(grid, t=judged.stamps.back(grid.t))
+    if not stray.at.size:
         return Item("stray fixes", "ok", "no fix lies where the vehicle cannot have been", 0.0)
-    shown = {"times": grid.t[found.at].tolist(), "off_m": found.size.tolist()}
-    text = found.words(grid).replace(" and is left out", "").replace(" and are left out", "")
-    return Item("stray fixes", "warn", f"{text}; fill leaves them out", float(found.at.size), "", line, shown)
+    shown = {"times": grid.t[stray.at].tolist(), "off_m": stray.size.tolist()}
+    text = stray.words(grid).replace(" and is left out", "").replace(" and are left out", "")
+    return Item("stray fixes", "warn", f"{text}; fill leaves them out", float(stray.at.size), "", fill_line(log), shown)
 
 
 def _number(value: float) -> float | None:

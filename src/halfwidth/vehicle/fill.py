@@ -32,7 +32,7 @@ from halfwidth.vehicle.choice import Answers, estimated
 from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, with_limits
 from halfwidth.vehicle.estimators import method as method_of
-from halfwidth.vehicle.grid import Grid
+from halfwidth.vehicle.grid import Grid, sampled
 from halfwidth.vehicle.judged import Findings, judged, sensed
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path
@@ -42,6 +42,7 @@ from halfwidth.vehicle.rows import counted
 from halfwidth.vehicle.running import FEWEST, top_speed
 from halfwidth.vehicle.sensors import Calibration
 from halfwidth.vehicle.stamps import Stamps
+from halfwidth.vehicle.stray import strays
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
 from halfwidth.vehicle.units import azimuth_put_right
 
@@ -224,14 +225,17 @@ def prepared(
         doubtful = distrusted(log, jumps=not whole)
         messages.extend(doubtful.words(log))
         log = doubtful.masked(log)
-    then = judged(log, offset=offset, distrust=distrust, second=second)
+    then = judged(log, offset=offset, stamped=second is not None)
     messages.extend(then.messages)
-    log, grid = then.log, then.grid
-    seen = grid.seen
-    if then.stray is not None:
-        grid = then.stray.masked(grid)
+    log = then.log
+    grid = sampled(log, sensors=then.sensors, second=second)
+    seen, found = grid.seen, None
+    if distrust:
+        stray = strays(grid, then.sensors)
+        messages.extend(filter(None, [stray.words(grid)]))
+        found = Findings(first, then, grid, stray) if offset is None and second is None else None
+        grid = stray.masked(grid)
     wanted, quality = wanted_rows(log)
-    found = Findings(first, then) if distrust and offset is None and second is None else None
     return Prepared(log, then.stamps, then.sensors, grid, seen, pieces_of(grid, log), wanted, quality, found)
 
 

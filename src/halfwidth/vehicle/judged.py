@@ -1,8 +1,8 @@
 """What a log is found to have wrong, in the order in which it is put right: one judgement for `fill` and `check`.
 
 First what the sensors say against themselves and against the fixes, which needs no model (`sensed`). Then, of a log
-whose doubtful fixes are left out, when its rows were taken, what its sensors are like and which fixes dead reckoning
-contradicts (`judged`).
+whose doubtful fixes are left out, when its rows were taken and what its sensors are like (`judged`). Which fixes dead
+reckoning contradicts comes last (`strays`).
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from halfwidth.vehicle.adrift import adrift, moved
 from halfwidth.vehicle.adrift import words as adrift_words
 from halfwidth.vehicle.align import calibrated
-from halfwidth.vehicle.grid import Grid, sampled
+from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.lapse import Lapse, put_right
 from halfwidth.vehicle.lapse import words as lapse_words
 from halfwidth.vehicle.lapses import lapses
@@ -19,7 +19,7 @@ from halfwidth.vehicle.pieces import with_pauses_filled
 from halfwidth.vehicle.sensors import Calibration
 from halfwidth.vehicle.spikes import Spikes, spikes
 from halfwidth.vehicle.stamps import Stamps, restamped
-from halfwidth.vehicle.stray import Strays, strays
+from halfwidth.vehicle.stray import Strays
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +87,6 @@ class Judged:
     stamps : Stamps
         Which times of the log as written its times are.
     sensors : Calibration
-    grid : Grid
-        With all its fixes.
-    stray : Strays or None
-        Fixes that lie where the vehicle cannot have been; None where they were not looked for.
     messages : tuple of str
         What a reader of a track must know.
     """
@@ -98,12 +94,10 @@ class Judged:
     log: Log
     stamps: Stamps
     sensors: Calibration
-    grid: Grid
-    stray: Strays | None
     messages: tuple[str, ...]
 
 
-def judged(log: Log, *, offset: float | None = None, distrust: bool = True, second: Log | None = None) -> Judged:
+def judged(log: Log, *, offset: float | None = None, stamped: bool = False) -> Judged:
     """Judge a log whose doubtful fixes are left out.
 
     Parameters
@@ -111,31 +105,37 @@ def judged(log: Log, *, offset: float | None = None, distrust: bool = True, seco
     log : Log
     offset : float, optional
         Seconds to add to the stamps of the sensors; found from the log if absent.
-    distrust : bool
-        Whether stray fixes are looked for.
-    second : Log, optional
-        Fixes of a second antenna, on the clock of the log as written, which is kept.
+    stamped : bool
+        Whether the stamps of the log are kept: another log is on the same clock.
 
     Returns
     -------
     Judged
     """
     stamps = Stamps(log.t, log.t)
-    if second is None:
+    if not stamped:
         log, stamps = restamped(log)
     messages = list(filter(None, [stamps.words()]))
     log = with_pauses_filled(log, messages)
     sensors = calibrated(log, clock_offset=offset)
-    messages += sensors.words()
-    grid = sampled(log, sensors=sensors, second=second)
-    stray = strays(grid, sensors) if distrust else None
-    messages += filter(None, [stray.words(grid)] if stray is not None else [])
-    return Judged(log, stamps, sensors, grid, stray, tuple(messages))
+    return Judged(log, stamps, sensors, (*messages, *sensors.words()))
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What `fill` found in a log when nothing of it was told: `check` finds the same."""
+    """What `fill` found in a log when nothing of it was told: `check` finds the same.
+
+    Parameters
+    ----------
+    sensed : Sensed
+    judged : Judged
+    grid : Grid
+        With all fixes that are not doubtful.
+    stray : Strays
+        Those of them that lie where the vehicle cannot have been.
+    """
 
     sensed: Sensed
     judged: Judged
+    grid: Grid
+    stray: Strays
