@@ -207,3 +207,11 @@ def test_real_logs(name, verdict, data):
     if name.startswith("driveplotr"):
         assert found["pauses"].value == 45.0
         assert found["step of lon_deg"].value == pytest.approx(2.0**-17, rel=1e-3)  # a float of 32 bits
+
+
+def test_streams_that_are_not_there_are_not_checked(tmp_path):
+    columns = {name: values for name, values in drive().items() if name in ("t_s", "lat_deg", "lon_deg")}
+    found = hw.vehicle.check(save(tmp_path / "log.csv", columns))
+    for name in ("pauses", "spikes", "sensor clock", "lapses", "speed"):
+        assert found[name].verdict == "not checked"
+        assert "there is no speed" in found[name].sentence

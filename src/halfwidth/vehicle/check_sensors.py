@@ -95,6 +95,13 @@ def has(log: Log, name: str) -> bool:
     return bool(np.isfinite(getattr(log, name)).any())
 
 
+def silent(log: Log, *names: str) -> str | None:
+    """Say that a log has none of some streams, None if it has one."""
+    words = {"speed_mps": "speed", "yaw_rate_radps": "yaw rate"}
+    lacking = [words[name] for name in names if not has(log, name)]
+    return f"there is no {' and no '.join(lacking)}" if len(lacking) == len(names) else None
+
+
 def fill_line(log: Log) -> str:
     """Return the command that fills a log."""
     source = log.source or "LOG"
@@ -103,6 +110,8 @@ def fill_line(log: Log) -> str:
 
 def far_clock(log: Log) -> tuple[Item, Log]:
     """Look for a clock of the sensors that is far off; return the log with them moved."""
+    if (reason := silent(log, "speed_mps")) is not None:
+        return Item("sensor clock", "not checked", reason), log
     seconds = adrift.adrift(log)
     if seconds is None:
         text = f"speed and fixes are within {adrift.NEAR:g} s of each other as far as stops and starts tell"
@@ -114,6 +123,8 @@ def far_clock(log: Log) -> tuple[Item, Log]:
 
 def lapsing(log: Log) -> tuple[Item, Log]:
     """Look for stretches in which speed or yaw rate contradict the fixes; return the log with them put right."""
+    if (reason := silent(log, "speed_mps", "yaw_rate_radps")) is not None:
+        return Item("lapses", "not checked", reason), log
     found = lapses(log)
     if not found:
         return Item("lapses", "ok", "no stretch of the speed or yaw rate contradicts the fixes by a factor", 0.0), log
