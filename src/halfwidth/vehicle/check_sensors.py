@@ -196,7 +196,8 @@ def _scale(log: Log, known: Calibration) -> Item:
         return Item(name, "not checked", "the fixes are too rough, or too few, to tell it")
     percent, sd = 100 * (1 / known.scale - 1), 100 * known.scale_sd
     warn = abs(percent) > 100 * _SCALE
-    text = f"the speed reads {percent:+.2f} % of the truth (standard deviation {sd:.2f} %)"
+    than = "more than" if percent > 0 else "less than"
+    text = f"the speed reads {abs(percent):.2f} % {than} the truth (standard deviation {sd:.2f} %)"
     line = fill_line(log) if warn else ""
     return Item(name, "warn" if warn else "ok", text, 1 / known.scale, "", line, {"sd": known.scale_sd})
 
