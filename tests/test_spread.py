@@ -70,3 +70,9 @@ def test_bent_quantiles_nest_and_are_finite_whatever_the_moments():
         assert np.all(ends[0] <= last[0] + 1e-12)
         assert np.all(ends[1] >= last[1] - 1e-12)
         last = ends
+
+
+@pytest.mark.parametrize("level", [0, 1, -0.5, np.nan, "0.9", None, [0.5, 0.9]])
+def test_a_level_is_a_probability(level):
+    with pytest.raises(hw.errors.BadValue, match=r"`level` is .*, a number between 0 and 1 was expected"):
+        hw.Normal([0.0], 1.0).interval(level)

@@ -55,7 +55,7 @@ class Score:
 
     def __repr__(self) -> str:
         name = max([len(r.method) for r in self.rows] + [6])
-        lines = [f"{'':{name}}  {'max error':>10}  {'rmse':>10}  {'inside':>8}  {'widest':>10}"]
+        lines = [f"{'':{name}}  {'max error':>10}  {'rmse':>10}  {'inside':>8}  {'widest':>10}   level"]
         for r in self.rows:
             inside = "-" if r.inside is None else f"{100 * r.inside:.3g} %"
             widest = "-" if r.widest is None else f"{r.widest:.3g}"

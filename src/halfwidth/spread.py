@@ -477,6 +477,6 @@ def part(spread: Spread | None, rows: slice) -> Spread | None:
 
 
 def _level(level: float) -> float:
-    if not 0.0 < level < 1.0:
+    if not isinstance(level, int | float | np.number) or not 0.0 < level < 1.0:
         raise BadValue(f"`level` is {level!r}, a number between 0 and 1 was expected", hint="level=0.9")
     return float(level)

@@ -268,3 +268,17 @@ def test_refuses_what_the_method_inside_refuses():
     gaussian = dataclasses.replace(CART, w=hw.Gaussian(1.0), e=hw.Gaussian(1.0))
     with pytest.raises(hw.Refused, match="uniform"):
         hw.estimate(gaussian, cart(5)[1], hw.Window(hw.BatchLP()))
+
+
+@pytest.mark.parametrize("nonlinear", [False, True])
+def test_outputs_near_the_largest_number_fit_nothing_and_warn_of_nothing(nonlinear):
+    unknown = hw.Uniform.unknown(at_most=3.0)
+    y = 1e300 * np.sin(np.arange(20.0))
+    if nonlinear:
+        model = hw.Nonlinear(lambda x: 0.9 * x, lambda x: x**2, unknown, unknown, hw.Normal([1.0], 1.0))
+        est = hw.estimate(model, hw.Record(np.arange(20.0), y), hw.Posterior(nodes=8))
+    else:
+        model = hw.Linear([[0.9]], None, [[1]], unknown, unknown, hw.Box([-1], [1]))
+        est = hw.estimate(model, hw.Record(np.arange(20.0), y), hw.Window(hw.Posterior(nodes=8), memory=5))
+    assert est.status is hw.Status.INFEASIBLE
+    assert np.isfinite(est.x).all()

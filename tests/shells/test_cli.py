@@ -476,6 +476,30 @@ def test_closed_standard_error_is_no_failure(log):
         assert found.stdout
 
 
+def test_closed_standard_output_is_no_failure(log):
+    found = subprocess.run(
+        [sys.executable, "-m", "halfwidth", "check", log], stderr=subprocess.PIPE, check=False,
+        preexec_fn=lambda: os.close(1),
+    )  # fmt: skip
+    assert (found.returncode, found.stderr) == (GOOD, b"")
+
+
+@pytest.mark.parametrize(
+    ("args", "hint"),
+    [
+        (["fill", "LOG", "-o"], "-o FOLDER/track.csv"),
+        (["fill", "LOG", "--report"], "--report FOLDER/drive.html"),
+        (["check", "LOG", "--report"], "--report FOLDER/check.html"),
+        (["estimate", "m.toml", "LOG", "-o"], "is a directory"),
+    ],
+)
+def test_a_folder_in_place_of_a_file_is_answered_with_the_flag_that_was_given(args, hint, log, tmp_path, capsys):
+    folder = tmp_path / "folder.csv"
+    folder.mkdir()
+    assert cli.run([str(log) if arg == "LOG" else arg for arg in args] + [str(folder)]) == USAGE
+    assert hint.replace("FOLDER", str(folder)) in capsys.readouterr().err
+
+
 def test_track_and_report_need_two_files(log, tmp_path, capsys):
     assert cli.run(["fill", str(log), "-o", str(tmp_path / "a.csv"), "--report", f"{tmp_path}/./a.csv"]) == USAGE
     assert "both claim" in capsys.readouterr().err

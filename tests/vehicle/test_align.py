@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from halfwidth.errors import BadValue
 from halfwidth.vehicle import Log, fill, simulate_drive
 from halfwidth.vehicle.align import calibrated, standstills
 from halfwidth.vehicle.check_sensors import items
@@ -269,3 +270,10 @@ def test_a_step_of_the_clocks_shows_on_poor_fixes_of_one_a_second(late):
             (_, before), (when, after) = offsets[name].at
             assert when == pytest.approx(160, abs=5)
             assert before - after == pytest.approx(late, abs=0.12)
+
+
+def test_a_clock_offset_longer_than_the_log_is_no_seconds():
+    _, log = simulate_drive(duration=60.0, seed=1, tunnels=[])
+    assert calibrated(log, clock_offset=-59.0).offsets["speed"].seconds == -59.0
+    with pytest.raises(BadValue, match=r"`clock_offset` is 150 s but the log is only 60\.0 s long"):
+        calibrated(log, clock_offset=150.0)

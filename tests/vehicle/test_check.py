@@ -242,3 +242,11 @@ def test_a_log_without_a_fix_is_judged_by_what_its_sensors_say():
     assert found["streams"].verdict == "bad"
     assert found["standstill"].verdict == "ok"
     assert found["stray fixes"].verdict == "not checked"
+
+
+def test_streams_that_are_not_there_are_not_checked(tmp_path):
+    columns = {name: values for name, values in drive().items() if name in ("t_s", "lat_deg", "lon_deg")}
+    found = hw.vehicle.check(save(tmp_path / "log.csv", columns))
+    for name in ("pauses", "spikes", "sensor clock", "lapses", "speed"):
+        assert found[name].verdict == "not checked"
+        assert "there is no speed" in found[name].sentence

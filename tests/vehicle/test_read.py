@@ -192,7 +192,7 @@ def test_a_header_behind_a_hash(tmp_path):
     np.testing.assert_allclose(hw.vehicle.read(path).speed_mps, TRUE["speed_mps"], atol=1e-7)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "cp1252"])
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "cp1252"])
 def test_encodings(encoding, tmp_path):
     path = tmp_path / "log.csv"
     path.write_bytes(text(with_columns(**UNITS)).encode(encoding))
@@ -456,6 +456,27 @@ def test_what_reading_took_away_is_said_where_too_little_is_left(tmp_path):
     columns = drive()
     with pytest.raises(BadLog, match="1199 rows with the time of the row before"):
         hw.vehicle.read(save(tmp_path / "log.csv", columns | {"t_s": np.full(1200, 5.0)}))
+    with pytest.raises(BadLog, match="1199 rows without a time dropped") as caught:
+        hw.vehicle.read(save(tmp_path / "log.csv", columns | {"t_s": np.where(np.arange(1200) == 0, 0.0, 1e300)}))
+    assert "--columns time=NAME" in caught.value.hint
+    with pytest.raises(BadLog, match="only one row has a position") as caught:
+        hw.vehicle.read(save(tmp_path / "log.csv", columns | {"lat_deg": np.where(np.arange(1200) == 0, 50.0, np.nan)}))
+    assert "--columns lat=NAME,lon=NAME" in caught.value.hint
+
+
+def test_what_stands_between_the_columns_is_asked_for_where_it_is_not_known(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(text(TRUE, delimiter="@"))
+    with pytest.raises(BadLog, match="no column that is read as time") as caught:
+        hw.vehicle.read(path)
+    assert "comma, semicolon, tab, bar or space" in caught.value.hint
+
+
+def test_a_column_that_is_not_known_is_named_where_the_speed_is_lacking(tmp_path):
+    named = {("swiftness" if name == "speed_mps" else name): values for name, values in TRUE.items()}
+    notes = hw.vehicle.read(save(tmp_path / "log.csv", named)).notes
+    assert "no column is read as speed; what is not read: swiftness" in notes
+    assert not any("not read" in note for note in hw.vehicle.read(save(tmp_path / "log.csv", TRUE)).notes)
 
 
 def test_streams_one_after_the_other_are_sorted_together(tmp_path):

@@ -69,6 +69,7 @@ def misfit(model: Nonlinear, record: Record, X: Array, variance: Array) -> float
     return squares(X[1:] - moved, off, variance)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a square beyond 1e308 is infinite, and so is their sum
 def squares(w: Array, e: Array, variance: Array) -> float:
     """Return squared noises (T, nx) and (T, ny), NaN where missing, over their variances (nx + ny,)."""
     nx = w.shape[1]

@@ -19,6 +19,7 @@ _BETTER = 3.0
 LEAST = 1e-3
 
 
+@np.errstate(over="ignore")  # beyond 1e154 a square is infinite, and nothing fits
 def first_path(model: Nonlinear, record: Record, near: Array | None) -> tuple[Array, Array]:
     """Return a path (T + 1, nx) and the scale of each noise (nx + ny,).
 

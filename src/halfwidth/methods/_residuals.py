@@ -182,6 +182,7 @@ class Reference:
     traceless: NDArray[np.bool_]
 
 
+@np.errstate(over="ignore")  # beyond 1e154 a square is infinite, and nothing fits
 def reference(rows: Residuals, model: Linear, known: Array) -> Reference:
     """Find the least-squares trajectory and the scale of each group.
 

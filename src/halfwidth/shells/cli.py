@@ -49,6 +49,8 @@ def run(args: Sequence[str]) -> int:
             raise
         _say("the command line needs typer, which is not installed\nhint: pip install 'halfwidth[app]'")
         return USAGE
+    if sys.stdout is None:  # closed by whoever started us: what nobody wants goes nowhere
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - as long as the process
     before: Any = None
     with suppress(ValueError):  # not the main thread: leave signals to whoever owns them
         # so that temporary files are cleared away when asked to stop

@@ -195,8 +195,8 @@ def fill(
     if output is not None and report is not None and os.path.abspath(output) == os.path.abspath(report):
         raise usage(f"`-o` and `--report` both claim `{output}`", "--report drive.html")
     method_known(method)
-    for path in (output, report):
-        writable(path, log, force)
+    writable(output, log, force)
+    writable(report, log, force, "--report {}/drive.html")
     if output is not None:
         ending_known(output, format_)
     if guaranteed is not None and not all(0 < v < math.inf for v in guaranteed):
@@ -251,9 +251,9 @@ def fill(
         for message in track.messages:
             words(f"note: {message}", quiet)
         words(track.summary(), quiet)
-        for path in (output, report):
-            if path not in (None, "-"):
-                words(f"wrote {path}", quiet)
+        for written_to in (output, report):
+            if written_to not in (None, "-"):
+                words(f"wrote {written_to}", quiet)
     return cli.GOOD
 
 
@@ -280,7 +280,7 @@ def check(
 
     if report == "-":
         raise usage("the page and the words of `check` both claim standard output", "--report check.html")
-    writable(report, log, force)
+    writable(report, log, force, "--report {}/check.html")
     found = examine(read(log, columns=columns, repair=False))
     if report is not None:
         found.report(report)
@@ -329,7 +329,7 @@ def outages(
         method_known(name)
     if plot is not None:
         figure_known("--plot", plot)
-        writable(plot, log, force)
+        writable(plot, log, force, "--plot {}/outages.png")
     found = read(log, columns=columns)
     with working("outages", quiet or no_progress) as progress:
         result = benchmark(
@@ -422,7 +422,7 @@ def estimate(
     if model == "-" and data == "-":
         raise usage("MODEL.toml and DATA both claim standard input", "give one of them as a file")
     estimator_known(method)
-    writable(output, data, force)
+    writable(output, data, force, "-o {}/states.csv")
     spec, settings = model_file(model)
     name = settings.pop("name", None)
     name = name if method is None else method

@@ -96,15 +96,15 @@ def limits_known(text: str) -> dict[str, tuple[float, float]]:
         raise usage(f"`--limits` is {text!r}: {error.message}", "--limits speed=0:30,acceleration=4") from error
 
 
-def writable(path: str | None, log: str, force: bool) -> None:
-    """Refuse an output that cannot be written before any work is done."""
+def writable(path: str | None, log: str, force: bool, example: str = "-o {}/track.csv") -> None:
+    """Refuse an output that cannot be written before any work is done; what to type instead goes by an example."""
     if path is None or path == "-":
         return
     target = Path(path)
     folder = target.parent
     try:
         if os.path.isdir(target):
-            raise usage(f"`{path}` is a directory, a file is expected", f"-o {path.rstrip('/')}/track.csv")
+            raise usage(f"`{path}` is a directory, a file is expected", example.format(path.rstrip("/")))
         if log != "-" and os.path.exists(target) and os.path.exists(log) and os.path.samefile(target, log):
             raise usage(f"`{path}` is the input itself", "give another name, the input is never overwritten")
         if os.path.isfile(target) and not force:

@@ -17,6 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from halfwidth.errors import BadValue
 from halfwidth.vehicle import evidence, reckoning, rolling
 from halfwidth.vehicle.clocks import OBSERVABLE, alike, marginal, offset_of, suspected
 from halfwidth.vehicle.frames import wrapped
@@ -66,7 +67,18 @@ def calibrated(log: Log, *, clock_offset: float | None = None) -> Calibration:
     -------
     Calibration
         Also for a log that tells nothing: then it says so and changes nothing.
+
+    Raises
+    ------
+    BadValue
+        If `clock_offset` is longer than the log, so that no fix and no sample of a sensor would meet.
     """
+    length = float(log.t[-1] - log.t[0]) if len(log) else 0.0
+    if clock_offset is not None and abs(clock_offset) > max(length, WIDEST):
+        raise BadValue(
+            f"`clock_offset` is {clock_offset:g} s but the log is only {length:.1f} s long: no fix would have a speed",
+            hint="give seconds, or leave it away: it is found from the log",
+        )
     known = replace(AS_LOGGED, steps=steps_of(log))
     fixes = int(log.fixed.sum())
     there = [name for name in _SENSORS if np.isfinite(getattr(log, STREAM[name])).any()]

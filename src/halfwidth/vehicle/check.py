@@ -282,6 +282,8 @@ def _gaps(log: Log) -> Item:
 
 def _pauses(log: Log, leaps: Sequence[tuple[float, float]]) -> Item:
     """Look for times at which the sensors that bridge a gap are silent as well; leaps of the clock are none."""
+    if (reason := check_sensors.silent(log, "speed_mps", "yaw_rate_radps")) is not None:
+        return Item("pauses", "not checked", reason)
     worst: tuple[float, float, str] | None = None
     for name in ("speed_mps", "yaw_rate_radps"):
         t = log.stream(name)[0]
@@ -303,6 +305,8 @@ def _pauses(log: Log, leaps: Sequence[tuple[float, float]]) -> Item:
 
 def _spikes(log: Log, first: Sensed) -> Item:
     """Say whether speeds and yaw rates of the log as given leap away and come back."""
+    if (reason := check_sensors.silent(log, "speed_mps", "yaw_rate_radps")) is not None:
+        return Item("spikes", "not checked", reason)
     found = first.spikes
     if found is None or not len(found):
         return Item("spikes", "ok", "no speed or yaw rate leaps away and comes back, or is stuck", 0.0)

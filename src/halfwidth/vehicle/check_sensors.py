@@ -94,6 +94,13 @@ def has(log: Log, name: str) -> bool:
     return bool(np.isfinite(getattr(log, name)).any())
 
 
+def silent(log: Log, *names: str) -> str | None:
+    """Say that a log has none of some streams, None if it has one."""
+    words = {"speed_mps": "speed", "yaw_rate_radps": "yaw rate"}
+    lacking = [words[name] for name in names if not has(log, name)]
+    return f"there is no {' and no '.join(lacking)}" if len(lacking) == len(names) else None
+
+
 def fill_line(log: Log) -> str:
     """Return the command that fills a log."""
     source = log.source or "LOG"
@@ -102,6 +109,8 @@ def fill_line(log: Log) -> str:
 
 def far_clock(log: Log, first: Sensed) -> Item:
     """Say whether the clock of the sensors is far off."""
+    if (reason := silent(first.clocked, "speed_mps")) is not None:
+        return Item("sensor clock", "not checked", reason)
     if first.far is None:
         text = f"speed and fixes are within {adrift.NEAR:g} s of each other as far as stops and starts tell"
         return Item("sensor clock", "ok", text, 0.0, "s")
@@ -111,6 +120,8 @@ def far_clock(log: Log, first: Sensed) -> Item:
 
 def lapsing(first: Sensed) -> Item:
     """Say in which stretches speed or yaw rate contradict the fixes."""
+    if (reason := silent(first.clocked, "speed_mps", "yaw_rate_radps")) is not None:
+        return Item("lapses", "not checked", reason)
     if not first.lapses:
         return Item("lapses", "ok", "no stretch of the speed or yaw rate contradicts the fixes by a factor", 0.0)
     said = "; ".join(words(first.clocked, first.lapses)).replace(": put right", "").replace(": not used", "")
@@ -179,7 +190,8 @@ def _scale(log: Log, known: Calibration) -> Item:
         return Item(name, "not checked", "the fixes are too rough, or too few, to tell it")
     percent, sd = 100 * (1 / known.scale - 1), 100 * known.scale_sd
     warn = abs(percent) > 100 * _SCALE
-    text = f"the speed reads {percent:+.2f} % of the truth (standard deviation {sd:.2f} %)"
+    than = "more than" if percent > 0 else "less than"
+    text = f"the speed reads {abs(percent):.2f} % {than} the truth (standard deviation {sd:.2f} %)"
     line = fill_line(log) if warn else ""
     return Item(name, "warn" if warn else "ok", text, 1 / known.scale, "", line, {"sd": known.scale_sd})
 

@@ -465,8 +465,9 @@ def _enough(log: Log, raw: Raw, notes: list[str]) -> None:
     lost = [note for note in notes if note.endswith("dropped") or "joined" in note]
     if lost:
         what += f" after reading ({'; '.join(lost)})"
+    untimely = len(log) < 2 <= raw.n_rows
     raise BadLog(
         f"`{raw.source}` has {counted(len(log), 'row')} and {what} (`{raw.uses['lat'].column}`,"
         f" `{raw.uses['lon'].column}`), at least two fixes are expected",
-        hint="--columns lat=NAME,lon=NAME names other columns",
+        hint=f"--columns {'time=NAME' if untimely else 'lat=NAME,lon=NAME'} names other columns",
     )

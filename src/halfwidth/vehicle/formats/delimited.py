@@ -256,6 +256,9 @@ def _encoding(head: bytes, name: str) -> str:
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     start = head[:65536]
+    for first, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):  # without a mark: every other byte of plain text is 0
+        if len(start) > 3 and not any(start[first:4096:2]) and all(start[1 - first : 4096 : 2]):
+            return encoding
     odd = sum(start.count(bytes([code])) for code in range(32) if code not in (9, 10, 12, 13))
     if b"\0" in start[:4096] or odd > 0.01 * len(start):
         raise BadLog(

@@ -366,6 +366,11 @@ def recognise(
     notes = [f"columns: {said}"]
     if passed:
         notes.append(f"columns passed over for a better one: {', '.join(map(_shown, passed[:8]))}")
+    absent = [role.replace("_", " ") for role in ("speed", "yaw_rate") if role not in uses]
+    known = {use.index for use in uses.values()}
+    strange = [name for k, name in enumerate(names) if k not in known and name.strip() not in passed]
+    if absent and strange:
+        notes.append(f"no column is read as {' or '.join(absent)}; what is not read: {_listed(strange, 8)}")
     return uses, notes
 
 
@@ -426,7 +431,9 @@ def unknown_layout(names: Sequence[str], lacking: Sequence[str], source: str) ->
         f"`{source}` has no column that is read as {', '.join(words[role] for role in lacking)};"
         f" found: {_listed(names)}; needed: time, latitude, longitude; used where there: speed, yaw rate, azimuth,"
         " height, acceleration",
-        hint=f"say which column it is: --columns {typed} (with a unit where needed: speed=NAME[km/h])",
+        hint=f"say which column it is: --columns {typed} (with a unit where needed: speed=NAME[km/h])"
+        if len(names) > 1
+        else "put a comma, semicolon, tab, bar or space between the columns",
     )
 
 
