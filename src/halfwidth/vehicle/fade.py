@@ -31,7 +31,7 @@ _WIDE = 10.0
 
 #: The chain that is asked whether it was a fault or a jump of the slow error. A slow error that hardly moves is learnt
 #: slowly, and one that is taken to move more than it does explains every fade.
-JUDGE = chain.Chain(rounds=40)
+JUDGE = chain.Chain()
 
 #: Half of the worth is hope enough to look closer.
 _HOPE = 0.5
