@@ -28,10 +28,10 @@ The residuals are solved for the new state, which makes a linear model ``z[k] = 
 rotated with the car: a Rauch-Tung-Striebel smoother (the core's) gives the path, and the scales are those of the
 largest likelihood. At its maximum a scale is the mean of squared residuals of the path, each residual counted by how
 much of it the fixes tell (Harville 1977, MacKay 1992; `_learnt`): twice the logarithmic step of a rule that never
-lowers the likelihood (Zhou, Hu, Zhou and Lange 2019), and never seen to lower it here. It comes near the
-maximum in some 16 rounds; expectation maximisation is as near after hundreds, since a scale that is too large explains
-any path. Each round re-linearises about its own path first, and where the likelihood falls the drive goes half of its
-step back and takes shorter ones from then on. Many drives (outages of one log) are solved side by side.
+lowers the likelihood (Zhou, Hu, Zhou and Lange 2019), and where the likelihood falls a drive takes half of it from then
+on. It comes near the maximum in some 20 rounds; expectation maximisation is as near after hundreds, since a scale that
+is too large explains any path. Each round re-linearises about its own path first. Many drives (outages of one log) are
+solved side by side.
 
 Where a yaw rate is silent for a while its residual has no noise of its own: the yaw rate is what the log's own are
 like, and how it deviates from what is expected between the samples on both sides is one more state (`turning`). A gap
@@ -250,9 +250,8 @@ def _solved(
     learns = settings.learns
     jumps = settings.slow and bool(np.isfinite(settings.tail))
     s2 = np.where(learns, sigma, _FLOOR) ** 2
-    # of each drive: scales and azimuths before its last step, the likelihood there, and what share of a step is taken
-    start, about = s2, psi
-    reached, stride, gained = np.full(len(drives), -np.inf), np.ones(len(drives)), np.zeros(len(drives))
+    # of each drive: the scales before its last step, the likelihood there, and what share of a step is taken
+    start, reached, stride, gained = s2, np.full(len(drives), -np.inf), np.ones(len(drives)), np.zeros(len(drives))
     for k in range(settings.rounds):
         last = k == settings.rounds - 1
         line = _linearised(rows, psi)
@@ -261,18 +260,16 @@ def _solved(
         gained = np.where(np.isfinite(reached), worth - reached, 0.0)
         if last:
             break
-        fell = ~(worth > reached - _SLACK)
-        stride, reached = np.where(fell, 0.5 * stride, stride), np.where(fell, reached, np.maximum(reached, worth))
-        back = fell[rows.drive]
-        found = psi + stride[rows.drive] * (out.x[:, AZIMUTH] - psi)
-        found = np.where(np.isfinite(found), found, psi)
-        psi, about = np.where(back, 0.5 * (psi + about), found), np.where(back, about, psi)
+        # azimuths go on all the same: from afar their way to what fits may lead through what does not
+        psi = np.where(np.isfinite(out.x[:, AZIMUTH]), out.x[:, AZIMUTH], psi)
+        fell, reached = ~(worth > reached - _SLACK), worth
+        stride = np.where(fell, 0.5, stride)
         new = s2
         if learn:
             ratio = np.where(learns, _learnt(rows, out, s2, share), 1.0)
             new = np.clip(s2 * ratio ** stride[:, None], _FLOOR**2, _CEILING**2)
         if jumps:
-            share = np.where(back, share, _shares(rows, out, s2, settings.tail))
+            share = _shares(rows, out, s2, settings.tail)
         s2, start = np.where(fell[:, None], np.sqrt(s2 * start), new), np.where(fell[:, None], start, s2)
     return [_fit(rows, out, s2[i], share, i, drive, settings, float(gained[i])) for i, drive in enumerate(drives)]
 

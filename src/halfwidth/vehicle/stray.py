@@ -341,9 +341,8 @@ class _Search:
         doubtful fixes put back by as much as they are off: by a constant, a trend and a bend, as far as they are
         enough. The likelihood must grow by more than what these numbers are worth, each the logarithm of how little of
         `_WIDE` is left for it, and by how rare wrong fixes are; a jump inside the gap is a rival as well (`jumped`).
-        Next to some that are wrong it need only grow. What the
-        other side of the gap says against it counts as well. In the middle of fixes both sides were asked before, and
-        the odds are 0.
+        Next to some that are wrong it need only grow. What the other side of the gap says against it counts as well.
+        In the middle of fixes both sides were asked before, and the odds are 0.
         """
         asked = [doubt for doubt in found if doubt.before != doubt.after]
         parts = [self._around(doubt, found[doubt].nodes) for doubt in asked]
