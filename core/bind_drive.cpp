@@ -80,7 +80,9 @@ nb::dict smooth(const Offsets& offsets, const Order& order, const Vector& h, con
     a.x = give("x", {rows, states});
     a.P = covariances ? give("P", {rows, states, states}) : nullptr;
     a.squares = squares ? give("squares", {rows, hw::drive_groups}) : nullptr;
+    a.spread = squares ? give("spread", {rows, hw::drive_groups}) : nullptr;
     a.misfit = give("misfit", {drives});
+    a.unsure = give("unsure", {drives});
     a.counted = give("counted", {drives});
     a.loglik = give("loglik", {drives});
     nb::list code;

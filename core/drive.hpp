@@ -17,7 +17,7 @@
 //
 //     E (g'w)^2 = (g'w of the means)^2 + u' (P_s+ + A P A') u + (g - u)' Q (g - u),     u = g - G' A' g
 //
-// (u is H'g with H = I - A G, and A G = I - H). A has about three entries a row and is never written down; what is
+// (u is H'g with H = I - A G, and A G = I - H): the square of its mean, and its variance. A has about three entries a row and is never written down; what is
 // symmetric is found once. Four drives go side by side, one in each lane, whatever their lengths: a drive that has ended
 // repeats its last row and says nothing more.
 #pragma once
@@ -343,14 +343,14 @@ struct Drives {
     }
 
     void smooth() {
-        V misfit(0.0), counted(0.0), broken(0.0);
+        V misfit(0.0), unsure(0.0), counted(0.0), broken(0.0);
         for (std::int64_t t = T - 1;; t--) {
             std::int64_t at[abreast];
             place(t, at);
             for (int l = 0; l < used; l++)
                 if (t == rows[l] - 1) start(t, l);
             const V seen = fixes(t, at);
-            misfit += seen * left(at);
+            left(at, seen, &misfit, &unsure);
             counted += seen;
             V sound(0.0);
             for (int i = 0; i < N; i++) sound += x[i] * V(0.0) + P[i][i] * V(0.0);
@@ -361,10 +361,12 @@ struct Drives {
         }
         for (int l = 0; l < used; l++) {
             a.misfit[which[l]] = misfit[l];
+            a.unsure[which[l]] = unsure[l];
             a.counted[which[l]] = counted[l];
             a.code[which[l]] = broken[l] == 0.0 ? 0 : drive_broken;
             if (a.squares)
-                for (int g = 0; g < drive_groups; g++) a.squares[begin[l] * drive_groups + g] = 0.0;
+                for (int g = 0; g < drive_groups; g++)
+                    a.squares[begin[l] * drive_groups + g] = a.spread[begin[l] * drive_groups + g] = 0.0;
         }
     }
     // The way back of one lane begins: its belief is that of the filter.
@@ -377,15 +379,14 @@ struct Drives {
                 P[j][i].set(l, *from);
             }
     }
-    // Expected square of what fixes are off the path, of both axes together.
-    inline V left(const std::int64_t* at) const {
-        V sum(0.0);
+    // Adds the square of what a row's fixes are off the path, and the variance of that, of both axes together.
+    inline void left(const std::int64_t* at, V seen, V* misfit, V* unsure) const {
         const int e[2] = {d_e, d_n}, o[2] = {d_oe, d_on};
         for (int i = 0; i < 2; i++) {
             const V off = gathered(a.y, at, 2, i) - x[e[i]] - x[o[i]];
-            sum += off * off + P[e[i]][e[i]] + P[e[i]][o[i]] + P[o[i]][e[i]] + P[o[i]][o[i]];
+            *misfit += seen * off * off;
+            *unsure += seen * (P[e[i]][e[i]] + P[e[i]][o[i]] + P[o[i]][e[i]] + P[o[i]][o[i]]);
         }
-        return sum;
     }
     inline void write(std::int64_t t, const std::int64_t* at) const {
         for (int l = 0; l < used; l++) {
@@ -433,10 +434,12 @@ struct Drives {
             return sum;
         });
     }
-    // The expected squares of the residuals into row t, of which xs, D are the smoothed mean before it and P + A P A'.
+    // The residuals into row t, of which xs, D are the smoothed mean before it and P + A P A': squares of their means, and
+    // their variances.
     inline void squares(std::int64_t t, const std::int64_t* at, const V* xs, const V (*D)[N]) const {
         const DriveStep<N>& s = step;
-        V found[drive_groups] = {V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)};
+        V found[drive_groups] = {V(0.0), V(0.0), V(0.0), V(0.0), V(0.0)}, spread[drive_groups];
+        for (int g = 0; g < drive_groups; g++) spread[g] = V(0.0);
         V dz[N];  // w of the means
         s.forward([&](int k) { return xs[k]; }, [&](int k, V v) { dz[k] = v; });
         s.add_b(dz);
@@ -455,7 +458,8 @@ struct Drives {
                 for (int j = 0; j < i; j++) row += D[i][j] * u[j];
                 sum += row * u[i];
             }
-            found[group] += mean * mean + larger(V(2.0) * sum, V(0.0)) + s.noise(rest);
+            found[group] += mean * mean;
+            spread[group] += larger(V(2.0) * sum, V(0.0)) + s.noise(rest);
         };
         const V none(0.0), one(1.0);
         const V along[] = {s.S, s.C, none, none, none, none, none, none, none, none};
@@ -470,7 +474,10 @@ struct Drives {
         }
         for (int l = 0; l < used; l++)
             if (t < rows[l])
-                for (int g = 0; g < drive_groups; g++) a.squares[at[l] * drive_groups + g] = found[g][l];
+                for (int g = 0; g < drive_groups; g++) {
+                    a.squares[at[l] * drive_groups + g] = found[g][l];
+                    a.spread[at[l] * drive_groups + g] = spread[g][l];
+                }
     }
 };
 

@@ -30,8 +30,9 @@ struct DriveArgs {
     // found
     double* x;                     // (R,size)
     double* P;                     // (R,size,size) or null
-    double* squares;               // (R,groups) or null: expected squares of the residuals; 0 in first rows
-    double *misfit, *counted;      // (n,): sum of expected squares of what fixes are off, both axes; number of fixes
+    double *squares, *spread;      // (R,groups) or null: squares of the residuals' means, their variances; 0 in first rows
+    double *misfit, *unsure;       // (n,): sums of squares of what fixes are off the path, both axes; of their variances
+    double* counted;               // (n,): number of fixes
     double* loglik;                // (n,)
     std::int32_t* code;            // (n,): 0, or `drive_broken`: then not all of the above is finite
     double* work;                  // drive_work doubles

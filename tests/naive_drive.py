@@ -29,7 +29,7 @@ def residuals(a, t, size):
 
 
 def smooth(a):
-    """One drive: x, P, squares, misfit, counted, loglik; arguments as those of `_core.drive_smooth`, by name."""
+    """One drive: x, P, squares, spread, misfit, unsure, counted, loglik; arguments as those of `_core.drive_smooth`, by name."""
     T, size = len(a["h"]), a["x0"].size
     A, Q, b = np.tile(np.eye(size), (T, 1, 1)), np.zeros((T, size, size)), np.zeros((T, size))
     rows = {t: residuals(a, t, size) for t in range(1, T)}
@@ -42,12 +42,20 @@ def smooth(a):
     seen = np.column_stack((a["seen"], a["seen"]))
     x, P, xp, Pp, ll = naive.kf(A, None, C, Q, R, a["y"], seen, a["x0"], P0, b=b)
     x, P, _, _, lag = naive.rts(A, Q, x, P, xp, Pp, a["x0"], P0)
-    squares = np.zeros((T, 5))
+    squares, spread = np.zeros((T, 5)), np.zeros((T, 5))
     for t, (new, old, lacks, _) in rows.items():
         off = new @ x[t] + old @ x[t - 1] + lacks
         cross = new @ lag[t] @ old.T
-        every = off**2 + np.diag(new @ P[t] @ new.T + old @ P[t - 1] @ old.T + cross + cross.T)
-        squares[t] = *every[:3], every[3] + every[4], every[7] + every[8]
-    off = (a["y"] - x @ C.T)[a["seen"]]
-    misfit = float(np.sum(off**2) + np.einsum("ij,tjk,ik->", C, P[a["seen"]], C))
-    return {"x": x, "P": P, "squares": squares, "misfit": misfit, "counted": a["seen"].sum(), "loglik": ll.sum()}
+        variance = np.diag(new @ P[t] @ new.T + old @ P[t - 1] @ old.T + cross + cross.T)
+        for to, every in ((squares, off**2), (spread, variance)):
+            to[t] = *every[:3], every[3] + every[4], every[7] + every[8]
+    return {
+        "x": x,
+        "P": P,
+        "squares": squares,
+        "spread": spread,
+        "misfit": float(np.sum((a["y"] - x @ C.T)[a["seen"]] ** 2)),
+        "unsure": float(np.einsum("ij,tjk,ik->", C, P[a["seen"]], C)),
+        "counted": a["seen"].sum(),
+        "loglik": ll.sum(),
+    }

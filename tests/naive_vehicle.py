@@ -8,7 +8,7 @@ N = 9
 def chain_round(
     t, east, north, seen, v, w, psi, sigma, *, memory=60.0, drift=10.0, scale_sd=0.03, bias_sd=0.01, far=100.0
 ):
-    """One round about the azimuths psi, all tails Gaussian: mean (T, 9), covariance (9T, 9T) and the new scales (7,).
+    """One round about the azimuths psi, all tails Gaussian: mean (T, 9), covariance (9T, 9T) and scales (7,) a step on.
 
     Each row of the table is written down as it stands, divided by its standard deviation; the covariance is the
     inverse of the normal matrix. Sensors are never silent here.
@@ -60,7 +60,7 @@ def chain_round(
     A, c = J / sd[:, None], b / sd
     z = np.linalg.lstsq(A, c, rcond=None)[0]
     P = np.linalg.inv(A.T @ A)
-    square = (A @ z - c) ** 2 + np.einsum("ri,ij,rj->r", A, P, A)  # in units of the present scales
+    square, told = (A @ z - c) ** 2, 1.0 - np.einsum("ri,ij,rj->r", A, P, A)  # in units of the present scales
     slips = np.array(slips)
     new = []
     for g in range(7):
@@ -68,7 +68,7 @@ def chain_round(
             g, 1.0 * (group == g)
         )
         per_row = 2 if g >= 4 else 1  # both axes share a row of the core
-        new.append(sigma[g] * np.sqrt((count @ square / per_row + 1.0) / (count.sum() / per_row + 1.0)))
+        new.append(sigma[g] * ((count @ square / per_row + 1.0) / (count @ told / per_row + 1.0)) ** 0.5)
     z = z.reshape(T, N)
     z[:, 0] += e0
     z[:, 1] += n0

@@ -74,10 +74,9 @@ def test_drives_agree_with_the_textbook(lengths, turn):
         sd = np.sqrt(np.diagonal(want["P"], axis1=1, axis2=2))
         assert np.max(np.abs(out["x"][part] - want["x"]) / sd) < 1e-9
         assert np.max(np.abs(out["P"][part] - want["P"]) / (sd[:, :, None] * sd[:, None])) < 1e-9
-        np.testing.assert_allclose(
-            out["squares"][part], want["squares"], rtol=1e-8, atol=1e-11
-        )  # those of the twin cancel
-        for name in ("misfit", "loglik"):
+        for name in ("squares", "spread"):  # variances of the twin cancel
+            np.testing.assert_allclose(out[name][part], want[name], rtol=1e-8, atol=1e-11)
+        for name in ("misfit", "unsure", "loglik"):
             assert out[name][i] == pytest.approx(want[name], rel=1e-9, abs=1e-9)
         assert out["counted"][i] == want["counted"]
 
@@ -89,7 +88,7 @@ def test_a_drive_is_the_same_in_any_company():
     out = together(drives)
     for i, (one, part) in enumerate(zip(drives, parts(drives), strict=True)):
         alone = together([one])
-        for name in ("x", "P", "squares"):
+        for name in ("x", "P", "squares", "spread"):
             np.testing.assert_array_equal(out[name][part], alone[name])
         assert out["loglik"][i] == alone["loglik"][0]
 
@@ -97,7 +96,7 @@ def test_a_drive_is_the_same_in_any_company():
 def test_what_is_not_asked_is_not_given_and_changes_nothing():
     drives = [drive(np.random.default_rng(6), 30, True)]
     every, bare = together(drives), together(drives, covariances=False, squares=False)
-    assert not {"P", "squares"} & set(bare)
+    assert not {"P", "squares", "spread"} & set(bare)
     np.testing.assert_array_equal(every["x"], bare["x"])
     np.testing.assert_array_equal(every["misfit"], bare["misfit"])
 
@@ -123,11 +122,12 @@ def test_edges_stay_finite(what):
         one["keep"] = one["fade"] = np.zeros(60)
     out = together([one])
     assert out["code"] == [0]
-    for name in ("x", "P", "squares", "misfit", "loglik"):
+    for name in ("x", "P", "squares", "spread", "misfit", "unsure", "loglik"):
         assert np.isfinite(out[name]).all(), name
     diagonal = np.diagonal(out["P"], axis1=1, axis2=2)
     assert np.all(diagonal >= 0)
     assert np.all(out["squares"] >= 0)
+    assert np.all(out["spread"] >= 0)
 
 
 def test_a_broken_drive_says_so_and_harms_no_other():

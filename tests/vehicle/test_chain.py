@@ -32,14 +32,41 @@ def test_one_round_is_dense_least_squares_over_the_rows_of_the_table():
         np.testing.assert_allclose(fit.P, blocks, atol=1e-6 * np.abs(blocks).max(axis=0).max(), rtol=1e-4)
 
 
-def test_scales_are_means_of_posterior_squares():
+def test_the_step_of_the_scales_is_that_of_dense_squares():
     drive = sampled(noisy(duration=5.0).log).without(2.0, 3.0)
     *_, new = chain_round(
         drive.t, drive.east, drive.north, drive.seen, drive.speed, drive.yaw_rate, azimuth_of(drive), SIGMA
     )
     fit = chain.solve([drive], chain.Chain(rounds=2, **GAUSSIAN), sigma=SIGMA)[0]
-    # groups of both axes count one pseudo-row for two residuals
     np.testing.assert_allclose(fit.sigma, new, rtol=2e-3)
+
+
+def likelihood(drive, sigma, azimuth):
+    fits = chain.solve([drive], chain.Chain(rounds=1, **GAUSSIAN), sigma=sigma, azimuth=[azimuth], learn=False)
+    return fits[0].loglik
+
+
+@pytest.mark.parametrize("start", [0.1, 1.0, 5.0])
+def test_the_likelihood_is_at_its_maximum_wherever_learning_starts(start):
+    drive = sampled(noisy(duration=100.0).log).without(40.0, 60.0)
+    fit = chain.solve([drive], chain.Chain(**GAUSSIAN), sigma=start * SIGMA)[0]
+    assert abs(fit.gained) < 0.1
+    found = fit.z[:, chain.AZIMUTH]
+    best = likelihood(drive, fit.sigma, found)
+    for g in range(len(chain.GROUPS)):
+        for factor in (0.7, 1.4):
+            other = fit.sigma.copy()
+            other[g] *= factor
+            assert likelihood(drive, other, found) < best + 0.5
+
+
+def test_a_step_that_lowers_the_likelihood_is_cut_in_half(monkeypatch):
+    drive = sampled(noisy(duration=100.0).log).without(40.0, 60.0)
+    best = chain.solve([drive], chain.Chain(**GAUSSIAN))[0].loglik
+    right = chain._learnt
+    monkeypatch.setattr(chain, "_learnt", lambda *given: right(*given) ** 2.5)
+    fit = chain.solve([drive], chain.Chain(rounds=60, **GAUSSIAN))[0]
+    assert fit.loglik > best - 1.0
 
 
 def test_learning_raises_the_likelihood():

@@ -25,9 +25,13 @@ scales (Lange, Little and Taylor 1989). In a gap, where nothing tells which incr
 square of those outside.
 
 The residuals are solved for the new state, which makes a linear model ``z[k] = A z[k-1] + b + w`` whose noise is
-rotated with the car: a Rauch-Tung-Striebel smoother (the core's) gives the path, and the scales are the means of
-posterior squared residuals (expectation maximisation, Shumway and Stoffer 1982). Each round re-linearises about its
-own path first. Many drives (outages of one log) are solved side by side.
+rotated with the car: a Rauch-Tung-Striebel smoother (the core's) gives the path, and the scales are those of the
+largest likelihood. At its maximum a scale is the mean of squared residuals of the path, each residual counted by how
+much of it the fixes tell (Harville 1977, MacKay 1992; `_learnt`): twice the logarithmic step of a rule that never
+lowers the likelihood (Zhou, Hu, Zhou and Lange 2019), and where the likelihood falls a drive takes half of it from then
+on. It comes near the maximum in some 20 rounds; expectation maximisation is as near after hundreds, since a scale that
+is too large explains any path. Each round re-linearises about its own path first. Many drives (outages of one log) are
+solved side by side.
 
 Where a yaw rate is silent for a while its residual has no noise of its own: the yaw rate is what the log's own are
 like, and how it deviates from what is expected between the samples on both sides is one more state (`turning`). A gap
@@ -62,6 +66,9 @@ _START = np.array([0.1, 0.05, 0.05, 0.01, 0.3, 0.1, 0.3])
 #: A scale is not believed below the first or above the second.
 _FLOOR = np.array([1e-3, 1e-4, 1e-4, 1e-5, 1e-4, 1e-4, 3e-3])
 _CEILING = np.array([30.0, 3.0, 30.0, 3.0, 30.0, 30.0, 1e3])
+
+#: What re-linearising may take from the log-likelihood.
+_SLACK = 0.5
 
 LONGITUDINAL, LATERAL, SLIP, YAW, OFFSET, DRIFT, FIX = range(7)
 
@@ -128,6 +135,8 @@ class Fit:
         Posterior mean and covariance of the states.
     loglik : float
         Log-likelihood of the fixes, given the weights.
+    gained : float
+        By how much the last round of learning raised the likelihood: next to 0 where it is at its maximum.
     path : Path
     """
 
@@ -136,6 +145,7 @@ class Fit:
     z: Floats = field(repr=False)
     P: Floats = field(repr=False)
     loglik: float
+    gained: float
     path: Path = field(repr=False)
 
 
@@ -240,19 +250,28 @@ def _solved(
     learns = settings.learns
     jumps = settings.slow and bool(np.isfinite(settings.tail))
     s2 = np.where(learns, sigma, _FLOOR) ** 2
+    # of each drive: the scales before its last step, the likelihood there, and what share of a step is taken
+    start, reached, stride, gained = s2, np.full(len(drives), -np.inf), np.ones(len(drives)), np.zeros(len(drives))
     for k in range(settings.rounds):
         last = k == settings.rounds - 1
         line = _linearised(rows, psi)
         out = _smoothed(rows, line, s2, share, settings, squares=not last and (learn or jumps), covariances=last)
-        found = out.x[:, AZIMUTH]
-        psi = np.where(np.isfinite(found), found, psi)
-        if out.squares.size:
-            squares = _squares(rows, out.squares)
-            if jumps:
-                share = _shares(rows, squares[:, OFFSET], s2, settings.tail)
-            if learn:
-                s2 = np.where(learns, _learnt(rows, squares, share, out, s2), s2)
-    return [_fit(rows, out, s2[i], share, i, drive, settings) for i, drive in enumerate(drives)]
+        worth = out.loglik + _cost(rows, share, settings.tail) if jumps else out.loglik
+        gained = np.where(np.isfinite(reached), worth - reached, 0.0)
+        if last:
+            break
+        # azimuths go on all the same: from afar their way to what fits may lead through what does not
+        psi = np.where(np.isfinite(out.x[:, AZIMUTH]), out.x[:, AZIMUTH], psi)
+        fell, reached = ~(worth > reached - _SLACK), worth
+        stride = np.where(fell, 0.5, stride)
+        new = s2
+        if learn:
+            ratio = np.where(learns, _learnt(rows, out, s2, share), 1.0)
+            new = np.clip(s2 * ratio ** stride[:, None], _FLOOR**2, _CEILING**2)
+        if jumps:
+            share = _shares(rows, out, s2, settings.tail)
+        s2, start = np.where(fell[:, None], np.sqrt(s2 * start), new), np.where(fell[:, None], start, s2)
+    return [_fit(rows, out, s2[i], share, i, drive, settings, float(gained[i])) for i, drive in enumerate(drives)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,9 +297,11 @@ class _Smoothed:
 
     x: Floats  # (R, 9)
     P: Floats  # (R, 9, 9), and
-    squares: Floats  # (R, 5) expected squares of the residuals, given all fixes: empty where they are not asked for
-    misfit: Floats  # (n,) sums of the expected squares of what fixes are off, both axes
-    counted: Floats  # (n,) and counts
+    squares: Floats  # (R, 5) squares of the residuals of the path: empty where they are not asked for
+    spread: Floats  # (R, 5) and the variances of the residuals, given all fixes
+    misfit: Floats  # (n,) sums of the squares of what fixes are off the path, both axes
+    unsure: Floats  # (n,) sums of the variances of that
+    counted: Floats  # (n,) number of fixes
     loglik: Floats  # (n,)
     code: Sequence[int]  # (n,)
 
@@ -308,7 +329,7 @@ def _smoothed(
         P0[:, TURN] = 1.0
         turn = {"turn": rows.turn.size, "stay": rows.turn.keep, "q_turn": rows.turn.q}
     return _Smoothed(
-        **{"P": np.empty(0), "squares": np.empty(0)}
+        **{"P": np.empty(0), "squares": np.empty(0), "spread": np.empty(0)}
         | _core.drive_smooth(
             offsets=rows.offsets,
             order=rows.order,
@@ -352,20 +373,13 @@ def _stationary(s2: Floats, settings: Chain) -> tuple[Floats, Floats]:
     return 0.5 * m * s2[..., OFFSET] + drift * m * m * d / (m + d), drift
 
 
-def _squares(rows: Rows, found: Floats) -> Floats:
-    """Return posterior squared residuals (R, 6) over their squared weights; of the lateral one before it is shared."""
-    along, aside, yaw, offset, drift = found.T
-    squares = np.column_stack((along, aside, aside, yaw, 0.5 * offset / rows.h, 0.5 * drift / rows.h))
-    squares[:, [LONGITUDINAL, YAW]] /= rows.weight2[:, [LONGITUDINAL, YAW]]
-    return squares
-
-
-def _shares(rows: Rows, square: Floats, s2: Floats, tail: float) -> Floats:
-    """Return the weights (R,) of the increments of the offset from their mean squares of an axis."""
+def _shares(rows: Rows, out: _Smoothed, s2: Floats, tail: float) -> Floats:
+    """Return the weights (R,) of the increments of the offset from their expected squares, under scales s2."""
+    square = 0.5 * (out.squares + out.spread)[:, 3] / rows.h
     scale = s2[rows.drive, OFFSET]
     share = (tail + 2.0) / (tail + 2.0 * square / scale)
     n = len(rows.origin)
-    known = ~rows.gap & ~rows.first & np.isfinite(square)
+    known = _told(rows) & np.isfinite(square)
     count = np.bincount(rows.drive[known], minlength=n)
     mean = np.bincount(rows.drive[known], square[known], n) / np.maximum(count, 1)
     # where fixes are too rare to tell, an increment is as large as Student's distribution makes it
@@ -373,30 +387,48 @@ def _shares(rows: Rows, square: Floats, s2: Floats, tail: float) -> Floats:
     return np.clip(np.where(rows.gap, usual[rows.drive], np.where(np.isfinite(share), share, 1.0)), 1e-6, 1e6)
 
 
-def _learnt(rows: Rows, squares: Floats, share: Floats, out: _Smoothed, s2: Floats) -> Floats:
-    """Return the squared scales (n, 7): means of posterior squared residuals over squared weights.
+def _told(rows: Rows) -> Mask:
+    """Return the rows (R,) whose increment of the offset has a weight of its own."""
+    return ~rows.gap & ~rows.first
+
+
+def _cost(rows: Rows, share: Floats, tail: float) -> Floats:
+    """Return what weights cost (n,): with the likelihood given them the logarithm of Student's but for a constant."""
+    return (
+        0.5 * tail * np.bincount(rows.drive, np.where(_told(rows), np.log(share) - share + 1.0, 0.0), len(rows.origin))
+    )
+
+
+def _learnt(rows: Rows, out: _Smoothed, s2: Floats, share: Floats) -> Floats:
+    """Return by what the squared scales (n, 7) are to be multiplied.
+
+    The slope of the log-likelihood in the logarithm of a group's variance is (a - b) / 2: a sums the squared residuals
+    m^2 of the path over their variances V, and b how much of each residual the fixes tell, 1 - v / V, v its variance
+    given them. At the maximum they are equal. Where a residual belongs to two groups each has its part of V.
 
     Rows where a sensor was silent are left out. One pseudo-row at the present value keeps a short drive from learning
-    that it has no noise. The lateral residual is shared between its two groups by their present variances.
+    that it has no noise.
     """
-    aside = [LATERAL, SLIP]
-    own = s2[rows.drive][:, aside]
-    parts = own * rows.weight2[:, aside]
-    whole = parts.sum(axis=1, keepdims=True)
-    count, value = np.ones(squares.shape), squares.copy()
-    count[:, aside] = parts / whole
-    value[:, aside] *= parts * own / whole**2
-    value[:, OFFSET] *= share
-    keep = rows.counted & np.isfinite(squares)
-    total, counts = (np.add.reduceat(np.where(keep, one, 0.0), rows.offsets[:-1]) for one in (value, count))
-    new = s2.copy()
-    new[:, :FIX] = (total + s2[:, :FIX]) / (counts + 1.0)
-    new[:, FIX] = (0.5 * out.misfit + s2[:, FIX]) / (out.counted + 1.0)
-    new = np.where(np.isfinite(new), new, s2)
-    return np.clip(new, _FLOOR**2, _CEILING**2)
+    own, r = s2[rows.drive], s2[:, FIX]
+    along, aside, yaw = _variances(rows, own)
+    prior = np.column_stack((along, aside, yaw, own[:, OFFSET] * rows.h / share, own[:, DRIFT] * rows.h))
+    axes = np.array([1.0, 1.0, 1.0, 2.0, 2.0])
+    which = [LONGITUDINAL, LATERAL, LATERAL, 2, 3, 4]  # the residual of each group
+    part = np.ones((len(own), FIX))
+    part[:, [LATERAL, SLIP]] = own[:, [LATERAL, SLIP]] * rows.weight2[:, [LATERAL, SLIP]] / aside[:, None]
+    a, b = out.squares / (axes * prior), 1.0 - out.spread / (axes * prior)
+    keep = rows.counted & np.isfinite(a + b)[:, which]
+    sums = (np.where(keep, part * np.maximum(one, 0.0)[:, which], 0.0) for one in (a, b))
+    tops, bottoms = (np.add.reduceat(one, rows.offsets[:-1]) for one in sums)
+    tops = np.column_stack((tops, 0.5 * out.misfit / r))
+    bottoms = np.column_stack((bottoms, np.maximum(out.counted - 0.5 * out.unsure / r, 0.0)))
+    ratio = (tops + 1.0) / (bottoms + 1.0)
+    return np.where(np.isfinite(ratio), ratio, 1.0)
 
 
-def _fit(rows: Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain) -> Fit:
+def _fit(
+    rows: Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: Grid, settings: Chain, gained: float
+) -> Fit:
     part = slice(int(rows.offsets[i]), int(rows.offsets[i + 1]))
     z, P = out.x[part, :SIZE].copy(), out.P[part, :SIZE, :SIZE]
     z[:, [E, N]] += rows.origin[i]
@@ -424,7 +456,7 @@ def _fit(rows: Rows, out: _Smoothed, s2: Floats, share: Floats, i: int, drive: G
         Status.STALLED if broken else Status.OK,
         info,
     )
-    return Fit(sigma, share[part].copy(), z, P, float(out.loglik[i]), path)
+    return Fit(sigma, share[part].copy(), z, P, float(out.loglik[i]), gained, path)
 
 
 def learnt_noise(drive: Grid, fit: Fit, settings: Chain = Chain()) -> tuple[Floats, Floats, Floats]:

@@ -8,7 +8,8 @@ the shape D of one tau the gain of the log-likelihood is quadratic in a (general
 
 What S^-1 makes of fixes is what the smoother leaves of them over the variance of a fix, so each tau costs two runs of
 the smoother, whatever the number of fixes. The best fade is then held against the receiver's own slow error, which may
-jump: with noise and jumps learnt anew with the fade and without it.
+jump: with noise and jumps learnt anew with the fade and without it. Inside the gap nothing tells a jump, so one there
+is a rival of its own: of two numbers, it moves all fixes on that side and is forgotten as the slow error is.
 """
 
 from collections.abc import Sequence
@@ -29,9 +30,8 @@ _TAU, _FINER = 2.0 ** np.arange(-1.0, 4.0), 2.0 ** np.array([-0.75, -0.5, -0.25,
 #: How far off a fade begins, m, a standard deviation of each axis.
 _WIDE = 10.0
 
-#: The chain that is asked whether it was a fault or a jump of the slow error. A slow error that hardly moves is learnt
-#: slowly, and one that is taken to move more than it does explains every fade.
-JUDGE = chain.Chain(rounds=40)
+#: The chain that is asked whether it was a fault or a jump of the slow error.
+JUDGE = chain.Chain()
 
 #: Half of the worth is hope enough to look closer.
 _HOPE = 0.5
@@ -51,6 +51,8 @@ class Fade:
         By how much it raises the log-likelihood of the fixes.
     worth : float
         What its three numbers cost: the logarithm of how little of what they could have been is left for them.
+    rival : float
+        By how much more than it costs a jump of the slow error in the gap raises it; 0 where it does not.
     """
 
     east: float
@@ -58,6 +60,7 @@ class Fade:
     tau: float
     gain: float
     worth: float
+    rival: float = 0.0
 
     @property
     def size(self) -> float:
@@ -88,7 +91,7 @@ def fades(drives: Sequence[Grid], own: Sequence[NDArray[np.intp]], since: Sequen
     Returns
     -------
     list of Fade
-        The gain is that of `likely` where there is hope that it exceeds the worth, else 0.
+        Gain and rival are those of `likely` where there is hope that the gain exceeds the worth, else 0.
     """
     hidden = [drive.masked(np.isin(np.arange(len(drive)), k)) for drive, k in zip(drives, own, strict=True)]
     learnt = chain.solve(hidden, JUDGE)
@@ -98,9 +101,46 @@ def fades(drives: Sequence[Grid], own: Sequence[NDArray[np.intp]], since: Sequen
     for i, fade in zip(hope, _best([places[i] for i in hope], [_FINER * found[i].tau for i in hope]), strict=True):
         found[i] = max(found[i], fade, key=lambda one: one.gain - one.worth)
     hope = [i for i in hope if found[i].gain > found[i].worth]
-    gain = likely([places[i].drive for i in hope] + [found[i].removed(drives[i], own[i], since[i]) for i in hope])
-    said = {i: gain[len(hope) + n] - gain[n] for n, i in enumerate(hope)}
-    return [replace(fade, gain=said.get(i, 0.0)) for i, fade in enumerate(found)]
+    after = [bool(since[i][0] <= since[i][-1]) for i in hope]
+    jumps = jumped([drives[i] for i in hope], [own[i] for i in hope], after, [learnt[i] for i in hope])
+    without = [found[i].removed(drives[i], own[i], since[i]) for i in hope]
+    said = likely([drives[i] for i in hope] + without + [drive for drive, _ in jumps])
+    usual, faded, other = np.array(said).reshape(3, len(hope))
+    for n, i in enumerate(hope):
+        rival = max(float(other[n] - usual[n]) - jumps[n][1], 0.0)
+        found[i] = replace(found[i], gain=float(faded[n] - usual[n]), rival=rival)
+    return [fade if i in hope else replace(fade, gain=0.0) for i, fade in enumerate(found)]
+
+
+def jumped(
+    drives: Sequence[Grid], own: Sequence[NDArray[np.intp]], after: Sequence[bool], learnt: Sequence[chain.Fit]
+) -> list[tuple[Grid, float]]:
+    """Take the best jump of the slow error in a gap off the fixes on one side of it.
+
+    Parameters
+    ----------
+    drives : sequence of Grid
+        What is around each gap.
+    own : sequence of (m,) int arrays
+        Nodes of doubtful fixes beside it.
+    after : sequence of bool
+        Whether they are after the gap.
+    learnt : sequence of Fit
+        The chain without these fixes.
+
+    Returns
+    -------
+    list of (Grid, float)
+        The drive without the jump, and what the two numbers of the jump cost.
+    """
+    found = []
+    for drive, k, later, fit in zip(drives, own, after, learnt, strict=True):
+        nodes = np.arange(len(drive))
+        side = np.flatnonzero(drive.seen & ((nodes >= k[0]) if later else (nodes <= k[-1])))
+        since = np.abs(drive.t[side] - drive.t[k[0 if later else -1]])
+        jump = _best_of(_Place(drive, side, since, fit), np.array([JUDGE.memory]))
+        found.append((jump.removed(drive, side, since), jump.worth))
+    return found
 
 
 def likely(drives: Sequence[Grid]) -> list[float]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from halfwidth.vehicle import chain
 from halfwidth.vehicle.answers import FEWEST_CONTROLS, Answer, apart_of, furthest, off_path, unusual, wrong_of
 from halfwidth.vehicle.doubts import DOUBTED, Doubt, after_jumps, at_gaps, stretches
-from halfwidth.vehicle.fade import JUDGE, Fade, fades, likely
+from halfwidth.vehicle.fade import JUDGE, Fade, fades, jumped, likely
 from halfwidth.vehicle.grid import Grid
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.sensors import Calibration
@@ -275,7 +275,7 @@ class _Search:
         hope: dict[Doubt, tuple[Fade, _Wrong]] = {}
         for doubt, nodes, s, fade in zip(doubts, beside, since, found, strict=True):
             left = fade.left(s)
-            odds = fade.gain - fade.worth - _RARE
+            odds = fade.gain - fade.worth - fade.rival - _RARE
             if odds > 0 and left.max() > felt and left.min() < max(_OVER * left.max(), felt):
                 hope[doubt] = fade, _Wrong(odds, nodes[left > felt], left[left > felt])
         against = self._against(list(hope), [wrong.nodes for _, wrong in hope.values()])
@@ -283,7 +283,7 @@ class _Search:
         better = {}
         for (doubt, (fade, wrong)), less in zip(hope.items(), against, strict=True):
             times = unusual(self._usual(doubt, DOUBTED[1]))
-            likely = (fade.gain - less) / times**2 > fade.worth + _RARE
+            likely = (fade.gain - fade.rival - less) / times**2 > fade.worth + _RARE
             # of two that are about as likely, the one that leaves nothing behind
             if likely and wrong.clear - less > rival.get(doubt, 0.0) - _RARE:
                 better[doubt] = fade, wrong.clear
@@ -340,9 +340,9 @@ class _Search:
         The chain that knows such jumps learns from the drive around the gap as it is, and from the same with the
         doubtful fixes put back by as much as they are off: by a constant, a trend and a bend, as far as they are
         enough. The likelihood must grow by more than what these numbers are worth, each the logarithm of how little of
-        `_WIDE` is left for it, and by how rare wrong fixes are. Next to some that are wrong it need only grow. What the
-        other side of the gap says against it counts as well. In the middle of fixes both sides were asked before, and
-        the odds are 0.
+        `_WIDE` is left for it, and by how rare wrong fixes are; a jump inside the gap is a rival as well (`jumped`).
+        Next to some that are wrong it need only grow. What the other side of the gap says against it counts as well.
+        In the middle of fixes both sides were asked before, and the odds are 0.
         """
         asked = [doubt for doubt in found if doubt.before != doubt.after]
         parts = [self._around(doubt, found[doubt].nodes) for doubt in asked]
@@ -351,14 +351,17 @@ class _Search:
         hidden = [drive.masked(np.isin(np.arange(len(drive)), k)) for drive, k in zip(here, own, strict=True)]
         without = chain.solve(hidden, JUDGE) if asked else []
         moved = [_put_back(drive, k, fit.path) for drive, k, fit in zip(here, own, without, strict=True)]
-        gain = likely([*here, *moved]) if asked else []
+        jumps = jumped(here, own, [doubt.after for doubt in asked], without)
+        said = likely([*here, *moved, *(drive for drive, _ in jumps)])
+        usual, wrong, other = np.array(said).reshape(3, len(asked))
         against = self._against(asked, [found[doubt].nodes for doubt in asked])
         odds = dict.fromkeys(found, 0.0)
         for i, (doubt, k, fit) in enumerate(zip(asked, own, without, strict=True)):
             spread = fit.path.variance
             left = np.nan if spread is None else float(np.sqrt(np.median(spread[k])))
             worth = _RARE + 2 * min(k.size, _SHAPE) * max(np.log(_WIDE / left), 0.0)
-            odds[doubt] = gain[len(asked) + i] - gain[i] - against[i] - (0.0 if doubt.known else worth)
+            rival = max(float(usual[i]), float(other[i]) - jumps[i][1])
+            odds[doubt] = float(wrong[i]) - rival - against[i] - (0.0 if doubt.known else worth)
         return odds
 
     def _against(self, doubts: Sequence[Doubt], wrong: Sequence[NDArray[np.intp]]) -> list[float]:
