@@ -394,9 +394,8 @@ def _told(rows: Rows) -> Mask:
 
 def _cost(rows: Rows, share: Floats, tail: float) -> Floats:
     """Return what weights cost (n,): with the likelihood given them the logarithm of Student's but for a constant."""
-    return (
-        0.5 * tail * np.bincount(rows.drive, np.where(_told(rows), np.log(share) - share + 1.0, 0.0), len(rows.origin))
-    )
+    each = np.where(_told(rows), np.log(share) - share + 1.0, 0.0)
+    return np.asarray(0.5 * tail * np.bincount(rows.drive, each, len(rows.origin)))
 
 
 def _learnt(rows: Rows, out: _Smoothed, s2: Floats, share: Floats) -> Floats:
