@@ -1,7 +1,7 @@
 """Print how far off each method fills outages of real logs, and how `fill` does beside them.
 
     python benchmarks/accuracy.py [FOLDER OF LOGS] [--starts 20] [--seed 1] [--methods linear,em] [--lengths 1,5,30]
-                                  [--tracks 20] [--fair] [--silent speed_mps]
+                                  [--tracks 20] [--fair] [--even] [--silent speed_mps]
 
 Nothing is told of a log: clocks, scale and bias of its sensors are found from it. The first table of each log is that
 of `halfwidth outages`; the second one, where numbers are asked of the log, sets the chain beside them, in metres and as
@@ -10,15 +10,18 @@ a share of the error of a straight line on the same starts, since twenty random 
 The last table, the only one with `--fair`, hides the same stretches from the log before anything is learnt of it,
 several far apart at a time, and fills what is left by `fill` and by each single method, `fill(method=...)`: mean and
 mean of maxima of `fill`, how often its half-widths hold, how wide they are, the seconds a track takes, and the method
-that was best on these starts in hindsight. Then ratios with their standard errors, from the differences start by start:
+that was best on these starts in hindsight. Then ratios with their standard errors, from the differences start by start;
+starts whose stretches overlap tell the same twice, and count for as much less:
 
     mean, maxima   `fill` over the best method, of means and of means of maxima. The best of many methods on twenty
                    starts is partly luck, so this is above 1 even where no method is better;
     others best    `fill` over the method that is best on all the other starts, which is no luck;
     linear         `fill` over straight lines, mean / maxima.
 
-With `--silent` the named streams are hidden in these stretches as well. The slowest methods, which never are the best,
-are left out unless `--methods` has them.
+With `--even` the starts are spread evenly over all that could have been drawn, which leaves hardly any luck of starts:
+on a short log twenty random stretches of a minute lie on top of each other, and leave half of it out. With `--silent`
+the named streams are hidden in these stretches as well. The slowest methods, which never are the best, are
+left out unless `--methods` has them.
 """
 
 import argparse
@@ -40,6 +43,9 @@ from halfwidth.vehicle.stamps import restamped
 
 #: How much worse than the best single method `fill` may be.
 WORSE = 1.05
+
+#: Of so many random starts, in order, one is taken where they are to be spread evenly.
+EVERY = 20
 
 #: Name of `fill` among the methods, and those that it is set beside.
 FILL = "fill"
@@ -132,13 +138,21 @@ def beside(log, begins, length, methods, times, silent):
     return found
 
 
-def ratio(own, other, weight):
-    """Return the ratio of two means and the standard error of that from the differences, start by start."""
-    a, b = np.average(own, weights=weight), np.average(other, weights=weight)
-    share = weight / weight.sum() * len(weight)
-    apart = share * (own - a / b * other)
-    error = apart.std(ddof=1) / np.sqrt(len(weight)) / b if len(weight) > 1 else float("nan")
-    return a / b, error
+def overlap(start, length):
+    """Return the share (n, n) of stretches of one length that each has in common with each other."""
+    return np.clip(1.0 - np.abs(start[:, None] - start) / length, 0.0, None)
+
+
+def ratio(own, other, weight, alike):
+    """Return the ratio of two means and the standard error of that from the differences, start by start.
+
+    What two starts tell is alike by the share (n, n) of their stretches that is the same, `overlap` (Newey and West
+    1987).
+    """
+    a, b, n = np.average(own, weights=weight), np.average(other, weights=weight), len(weight)
+    apart = weight / weight.sum() * n * (own - a / b * other)
+    left = n * n - alike.sum()  # differences from a mean of their own are smaller than those from the true one
+    return a / b, np.sqrt(max(apart @ alike @ apart, 0.0) / left) / b if left > 0 else float("nan")
 
 
 def others_best(errors, weight):
@@ -149,7 +163,7 @@ def others_best(errors, weight):
     return np.array([table[np.argmin(sums - table[:, k] * weight[k]), k] for k in range(len(weight))])
 
 
-def compared(log, found, lengths, most, methods, silent):
+def compared(log, found, lengths, most, methods, silent, every=1):
     """Print the track of `fill` beside the single methods on the very same logs, with the same fixes hidden."""
     nodes = sampled(log, sensors=calibrated(log))
     times = nodes.t[nodes.seen]  # the fixes that `outages` compares with
@@ -159,24 +173,30 @@ def compared(log, found, lengths, most, methods, silent):
     )
     beyond = []
     for length in lengths:
-        begins = next((cell.start for cell in found.cells if cell.length == length), np.empty(0))[:most]
+        begins = next((cell.start for cell in found.cells if cell.length == length), np.empty(0))
+        begins = np.sort(begins)[every // 2 :: every] if every > 1 else begins[:most]
         if not len(begins):
             continue
         one = beside(log, begins, length, methods, times, silent)
         if not one.start:
             continue
-        n, alike = np.array(one.count, dtype=float), np.ones(len(one.start))
+        n, start = np.array(one.count, dtype=float), np.array(one.start)
+        same, once = overlap(start, length), np.ones(len(start))
         means = {name: np.array(v) for name, v in one.means.items()}
         maxima = {name: np.array(v) for name, v in one.maxima.items()}
         own, top = means.pop(FILL), maxima.pop(FILL)
+
+        def shares(mean, largest, own=own, top=top, n=n):
+            return np.average(own, weights=n) / np.average(mean, weights=n), top.mean() / largest.mean()
+
         best = min(means, key=lambda name: np.average(means[name], weights=n))
         best_top = min(maxima, key=lambda name: maxima[name].mean())
         pairs = {
-            "mean": ratio(own, means[best], n),
-            "maxima": ratio(top, maxima[best_top], alike),
-            "others": ratio(own, others_best(means, n), n),
+            "mean": ratio(own, means[best], n, same),
+            "maxima": ratio(top, maxima[best_top], once, same),
+            "others": ratio(own, others_best(means, n), n, same),
         }
-        line = ratio(own, means["linear"], n)[0], ratio(top, maxima["linear"], alike)[0]
+        line = shares(means["linear"], maxima["linear"]) if "linear" in means else (float("nan"),) * 2
         names = best if best == best_top else f"{best}, {best_top}"
         words = f"{names} {np.average(means[best], weights=n):.3f} / {maxima[best_top].mean():.3f}"
         print(
@@ -189,7 +209,7 @@ def compared(log, found, lengths, most, methods, silent):
         if max(pairs["mean"][0], pairs["maxima"][0]) > WORSE or max(line) > 1.0:
             beyond.append(f"{length:g} s")
         if best != "em" and "em" in means:
-            beside_em = ratio(own, means["em"], n)[0], ratio(top, maxima["em"], alike)[0]
+            beside_em = shares(means["em"], maxima["em"])
             print(f"{'':8}em alone: fill is {beside_em[0]:.2f} / {beside_em[1]:.2f} of it")
     print(f"beyond {WORSE:g} times the best single method or worse than linear: {', '.join(beyond) or 'no cell'}")
 
@@ -204,25 +224,29 @@ def main():
     parser.add_argument("--lengths", default=",".join(f"{length:g}" for length in LENGTHS))
     parser.add_argument("--tracks", type=int, default=20, help="stretches of each length hidden from fill")
     parser.add_argument("--fair", action="store_true", help="only the last table")
+    parser.add_argument("--even", action="store_true", help="evenly spread starts, not random ones")
     parser.add_argument("--silent", help="streams hidden there as well: speed_mps,yaw_rate_radps")
     asked = parser.parse_args()
+    if asked.even and not asked.fair:
+        parser.error("--even is for the last table: --fair --even")
+    every = EVERY if asked.even else 1
     lengths = tuple(float(length) for length in asked.lengths.split(","))
     methods = None if asked.methods is None else asked.methods.split(",")
     logs = sorted(path for ending in ("*.csv", "*.csv.gz", "*.parquet") for path in asked.folder.glob(ending))
     if not logs:
         parser.error(f"{asked.folder} has no logs")
+    silent = asked.silent.split(",") if asked.silent else ()
     for path in logs:
         # `outages` puts a log right that was written late; its starts are on that clock
         log = restamped(hw.vehicle.read(path))[0]
         print(f"\n=== {path.name}: seed {asked.seed}")
-        found = hw.vehicle.outages(log, lengths, asked.starts, asked.seed, ("linear",) if asked.fair else methods)
+        tried = ("linear",) if asked.fair else methods
+        found = hw.vehicle.outages(log, lengths, asked.starts * every, asked.seed, tried)
         if not asked.fair:
             print(found, end="\n\n", flush=True)
             asked_of(path.name, found)
         if asked.tracks:
-            compared(
-                log, found, lengths, asked.tracks, methods or BESIDE, asked.silent.split(",") if asked.silent else ()
-            )
+            compared(log, found, lengths, asked.tracks, methods or BESIDE, silent, every)
 
 
 if __name__ == "__main__":

@@ -49,6 +49,22 @@ def test_the_best_of_many_in_hindsight_is_lucky_and_that_of_the_other_starts_is_
     # what is better everywhere is found without luck
     means["k"] = 0.1 * own
     np.testing.assert_allclose(accuracy.others_best(means, weight), means["k"])
-    share, error = accuracy.ratio(own, means["k"], weight)
+    share, error = accuracy.ratio(own, means["k"], weight, np.eye(20))
     assert share == pytest.approx(10.0)
     assert error == pytest.approx(0.0, abs=1e-12)
+
+
+def test_starts_whose_stretches_overlap_count_for_less(accuracy):
+    rng = np.random.default_rng(3)
+    length, n, seconds = 30, 40, 600
+    shares, errors, apart = [], [], []
+    for _ in range(300):
+        start = rng.integers(0, seconds - length, n)
+        wander = rng.normal(0.0, 1.0, seconds)  # what one method is off more than the other in each second
+        own = 5.0 + np.array([wander[k : k + length].mean() for k in start])
+        share, error = accuracy.ratio(own, np.full(n, 5.0), np.ones(n), accuracy.overlap(start, length))
+        shares.append(share)
+        errors.append(error)
+        apart.append(accuracy.ratio(own, np.full(n, 5.0), np.ones(n), np.eye(n))[1])
+    assert np.mean(errors) == pytest.approx(np.std(shares), rel=0.2)
+    assert np.mean(apart) < 0.7 * np.std(shares)

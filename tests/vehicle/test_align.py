@@ -12,6 +12,7 @@ from halfwidth.vehicle.align import calibrated, standstills
 from halfwidth.vehicle.check_sensors import items
 from halfwidth.vehicle.formats import read
 from halfwidth.vehicle.grid import sampled
+from halfwidth.vehicle.judged import judged
 from halfwidth.vehicle.sensors import AS_LOGGED, Calibration, Offset
 
 CLEAN = {"duration": 300.0, "tunnels": [], "fix_noise": 0.02, "fix_offset": 0.02}
@@ -100,15 +101,16 @@ def test_a_clock_that_steps_is_found(late):
         speed_mps=speed,
         yaw_rate_radps=yaw,
     )
-    found = calibrated(stepped)
+    then = judged(stepped)
+    found = then.sensors
     for name in ("speed", "yaw_rate"):
         one = found.offsets[name]
         assert one.change == "step"
-        (_, before), (when, then) = one.at
+        (_, before), (when, now) = one.at
         assert before == pytest.approx(-late, abs=0.05)
-        assert then == pytest.approx(0, abs=0.05)
+        assert now == pytest.approx(0, abs=0.05)
         assert when == pytest.approx(450, abs=160)
-    (item,) = (one for one in items(stepped, found) if one.name == "clock of speed")
+    (item,) = (one for one in items(then) if one.name == "clock of speed")
     assert item.verdict == "warn"
     assert "steps at about" in item.sentence
 
@@ -144,13 +146,14 @@ def test_a_clock_that_drifts_is_found():
     _, log = simulate_drive(seed=3, clock_offset=0.1, **CLEAN | {"duration": 1500.0})
     moved = log.stream("speed_mps")[0] * 2.4e-4  # 0.36 s in 25 minutes
     speed = np.interp(log.t - moved, log.t, log.speed_mps)
-    found = calibrated(replace(log, speed_mps=speed))
+    then = judged(replace(log, speed_mps=speed))
+    found = then.sensors
     one = found.offsets["speed"]
     assert one.change == "drift"
     assert one.at[0][1] == pytest.approx(0.1, abs=0.05)
     assert one.at[-1][1] == pytest.approx(0.1 - 0.36, abs=0.05)
     assert found.offsets["yaw_rate"].change == ""
-    assert "drifts" in items(log, found)[0].sentence
+    assert "drifts" in items(then)[0].sentence
 
 
 def test_what_is_given_is_not_looked_for():

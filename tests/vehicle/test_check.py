@@ -1,12 +1,15 @@
 """What `check` says of a good log, of each fault, and of what it cannot know."""
 
 import json
+from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
 from tests.vehicle.drives import drive, save
 
 import halfwidth as hw
+from halfwidth.vehicle import Log, check, fill, simulate_drive
 from halfwidth.vehicle.align import quantisation
 
 
@@ -215,3 +218,35 @@ def test_streams_that_are_not_there_are_not_checked(tmp_path):
     for name in ("pauses", "spikes", "sensor clock", "lapses", "speed"):
         assert found[name].verdict == "not checked"
         assert "there is no speed" in found[name].sentence
+
+
+def test_what_fill_found_is_not_looked_for_again(tmp_path, monkeypatch):
+    _, log = simulate_drive(duration=200.0, seed=4, tunnels=(20.0,), speed_delay=0.3)
+    speed, lat = log.speed_mps.copy(), log.lat_deg.copy()
+    speed[600:603] = 90.0
+    fixes = np.flatnonzero(log.fixed)
+    after = fixes[np.argmax(np.diff(log.t[fixes])) + 1]
+    lat[after : after + 4] += 5e-4  # wrong first fixes after the tunnel
+    log = replace(log, speed_mps=speed, lat_deg=lat)
+    track, alone = fill(log), check(log)
+    assert alone["lapses"].verdict == "bad"
+    assert alone["stray fixes"].verdict == "warn"
+    module = import_module("halfwidth.vehicle.check")
+    for step in ("sensed", "judged"):
+        monkeypatch.setattr(module, step, None)
+    assert check(track.log, track.found).to_dict() == alone.to_dict()
+    assert "the speed says 90" in track.report(tmp_path / "page.html").read_text()
+
+
+def test_what_fill_was_told_is_no_finding():
+    _, log = simulate_drive(duration=100.0, seed=4, tunnels=(20.0,))
+    assert fill(log, clock_offset=0.0).found is None
+    assert fill(log, distrust=False).found is None
+
+
+def test_a_log_without_a_fix_is_judged_by_what_its_sensors_say():
+    nothing = [float("nan")] * 20
+    found = check(Log(t=range(20), lat_deg=nothing, lon_deg=nothing, speed_mps=[1.0] * 20, yaw_rate_radps=[0.1] * 20))
+    assert found["streams"].verdict == "bad"
+    assert found["standstill"].verdict == "ok"
+    assert found["stray fixes"].verdict == "not checked"

@@ -13,6 +13,7 @@ from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.check_sensors import items
 from halfwidth.vehicle.formats import from_frame, read
 from halfwidth.vehicle.grid import sampled
+from halfwidth.vehicle.judged import judged
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.stray import strays
 
@@ -88,15 +89,15 @@ def test_wrong_first_fixes_after_a_gap_do_not_bend_it(drive, clean, seconds, eas
     track = fill(wrong)
     assert said(track, "where the vehicle cannot have been")
     assert in_gaps(truth, track) < 2 * clean + 0.5
-    known = calibrated(wrong)
-    grid = sampled(wrong, sensors=known)
-    found = strays(grid, known)
+    then = judged(wrong)
+    grid = sampled(then.log, sensors=then.sensors)
+    found = strays(grid, then.sensors)
     times = grid.t[found.at]
     for _, last in GAPS:
         near = (times > last) & (times < last + seconds + 1)
         assert near.any()
         assert found.size[near].max() == pytest.approx(east, rel=0.2)  # named with its size
-    (item,) = (one for one in items(wrong, known) if one.name == "stray fixes")
+    (item,) = (one for one in items(then) if one.name == "stray fixes")
     assert item.verdict == "warn"
     assert item.evidence["off_m"]
 

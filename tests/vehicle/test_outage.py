@@ -7,6 +7,7 @@ from tests.vehicle.known import known, real_log
 
 import halfwidth as hw
 from halfwidth.errors import BadLog, BadValue
+from halfwidth.vehicle.drive import simulate_drive
 from halfwidth.vehicle.estimators import METHODS
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.outage import outages
@@ -155,6 +156,21 @@ def test_clocks_are_found_if_none_is_given():
     assert np.isnan(found.clock_offset)
     assert found.sensors
     assert found.cell("em", 10).mean < outages(log, (10,), 4, 1, ("em",), clock_offset=0.0).cell("em", 10).mean
+
+
+def test_a_speed_that_drops_to_0_for_a_while_is_no_speed_for_any_method():
+    _, log = simulate_drive(duration=400.0, seed=1, tunnels=())
+    dead = (log.t >= 150) & (log.t < 200)  # the car goes 11 m/s
+    wrong = dataclasses.replace(log, speed_mps=np.where(dead, 0.0, log.speed_mps))
+    methods = ("em", "em-white", "linear")
+    found = outages(wrong, (10.0,), 12, 1, methods)
+    clean = outages(log, (10.0,), 12, 1, methods)
+    for name in methods:
+        assert found.cell(name, 10.0).mean < 1.5 * clean.cell(name, 10.0).mean
+    assert any("the speed says 0 from 150.0 to 199.9 s" in one for one in found.messages)
+    assert "the speed says 0" in found.table()
+    assert found.to_dict()["messages"] == list(found.messages)
+    assert not clean.messages
 
 
 def test_progress_and_settings(log):

@@ -98,6 +98,22 @@ def test_a_clock_that_begins_anew_is_counted_on(period, name, late):
     assert any(f"begins anew with each {name}, 1 time" in note for note in read.notes)
 
 
+def test_a_drive_over_midnight_that_was_sorted_is_counted_on():
+    _, log = simulate_drive(duration=60, seed=5, tunnels=())
+    rows = table(log)
+    rows["time"] = (rows.time + 86_400.0 - 25.0) % 86_400.0
+    read = from_frame(rows.sort_values("time"))
+    assert np.allclose(np.diff(read.t), np.diff(log.t))
+    assert any("begins anew with each day" in note for note in read.notes)
+
+
+@pytest.mark.parametrize("times", [[0.0, 86_390.0], [0.0, 1.0, 86_390.0], [0.0, 0.1, 0.2, 86_380.0, 86_380.1]])
+def test_rows_in_order_that_pause_for_most_of_a_day_are_left_as_they_are(times):
+    read = from_frame(pd.DataFrame({"time[s]": times, "lat": np.linspace(50.0, 50.001, len(times)), "lon": 14.0}))
+    assert read.t[-1] - read.t[0] == pytest.approx(times[-1], rel=1e-9)
+    assert not any("begins anew" in note for note in read.notes)
+
+
 def test_rows_that_are_there_twice_in_no_order_are_one_drive():
     _, log = simulate_drive(duration=60, seed=5, tunnels=())
     rows = table(log)

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import check_sensors, check_units, evidence
-from halfwidth.vehicle.align import calibrated, steps_of
+from halfwidth.vehicle.align import steps_of
 from halfwidth.vehicle.check_sensors import Item as Item
 from halfwidth.vehicle.distrust import NOTHING, Distrust, distrusted
+from halfwidth.vehicle.judged import Findings, Sensed, judged, sensed
 from halfwidth.vehicle.log import STREAMS, Log
 from halfwidth.vehicle.sensors import Calibration
-from halfwidth.vehicle.spikes import spikes
-from halfwidth.vehicle.stamps import Stamps, delays, restamped
+from halfwidth.vehicle.stamps import Stamps, delays
 from halfwidth.vehicle.units import azimuth_put_right, matched_factor
 
 Floats = NDArray[np.float64]
@@ -168,13 +168,15 @@ class Check:
         return f"Check({self.source!r}: {self.verdict}, {n['bad']} bad, {n['warn']} warn, {n['ok']} ok)"
 
 
-def check(log: Any) -> Check:
+def check(log: Any, found: Findings | None = None) -> Check:
     """Say what is wrong with a log.
 
     Parameters
     ----------
     log : Log, path or table
         A path or table is read without putting units and signs right, so that they are reported.
+    found : Findings, optional
+        What `fill` found in this very log, `Track.found`; looked for if absent.
 
     Returns
     -------
@@ -197,29 +199,27 @@ def check(log: Any) -> Check:
         log = read(log, repair=False)
     elif not isinstance(log, Log):
         log = from_frame(log, repair=False)
-    leaping, log = _spikes(log)
-    far, log = check_sensors.far_clock(log)
-    lapsing, log = check_sensors.lapsing(log)
+    first = sensed(log) if found is None else found.sensed
+    leaping, far, lapsing = _spikes(log, first), check_sensors.far_clock(log, first), check_sensors.lapsing(first)
+    log = first.log
     swapped = check_units.swapped(log)
     basis = None
     if swapped.verdict == "bad":
-        first = "put latitude and longitude right first"
+        before = "put latitude and longitude right first"
         names = ("outliers", "speed", "azimuth", "yaw rate", "trust", "stamps", *check_sensors.NAMES)
-        moving = [Item(name, "not checked", first) for name in names]
+        moving = [Item(name, "not checked", before) for name in names]
     else:
         trust, doubted = _trust(log)
         believed = doubted.masked(log)
         moving = [_outliers(believed), check_units.speed(log), check_units.azimuth(log), check_units.yaw(log)]
         row = matched_factor(evidence.speed_ratio(log))
         if row is not None and row[3] != 1:
-            first = "put the time right first"
-            moving += [trust, *(Item(name, "not checked", first) for name in ("stamps", *check_sensors.NAMES))]
+            before = "put the time right first"
+            moving += [trust, *(Item(name, "not checked", before) for name in ("stamps", *check_sensors.NAMES))]
         else:
-            believed, _ = azimuth_put_right(believed)
-            said, stamps = restamped(believed)
-            known = calibrated(said)
-            basis = Basis(said, log, known, stamps, doubted)
-            moving += [trust, _stamps(believed, stamps), *check_sensors.items(said, known, stamps)]
+            then = judged(azimuth_put_right(believed)[0]) if found is None else found.judged
+            basis = Basis(then.log, log, then.sensors, then.stamps, doubted)
+            moving += [trust, _stamps(believed, then.stamps), *check_sensors.items(then, found)]
     items = (
         _streams(log),
         _rates(log),
@@ -303,16 +303,15 @@ def _pauses(log: Log, leaps: Sequence[tuple[float, float]]) -> Item:
     return Item("pauses", "warn", f"no {name} for {length:.1f} s from {start:.1f} s on{also}", length, "s")
 
 
-def _spikes(log: Log) -> tuple[Item, Log]:
-    """Look for speeds and yaw rates that leap away and come back; return the log without them."""
+def _spikes(log: Log, first: Sensed) -> Item:
+    """Say whether speeds and yaw rates of the log as given leap away and come back."""
     if (reason := check_sensors.silent(log, "speed_mps", "yaw_rate_radps")) is not None:
-        return Item("spikes", "not checked", reason), log
-    found = spikes(log)
-    if not len(found):
-        return Item("spikes", "ok", "no speed or yaw rate leaps away and comes back, or is stuck", 0.0), log
+        return Item("spikes", "not checked", reason)
+    found = first.spikes
+    if found is None or not len(found):
+        return Item("spikes", "ok", "no speed or yaw rate leaps away and comes back, or is stuck", 0.0)
     said = "; ".join(words.removesuffix(": not used") for words in found.words(log))
-    item = Item("spikes", "warn", said, float(len(found)), line=check_sensors.fill_line(log))
-    return item, found.masked(log)
+    return Item("spikes", "warn", said, float(len(found)), line=check_sensors.fill_line(log))
 
 
 def _outliers(log: Log) -> Item:

@@ -13,11 +13,10 @@ import numpy as np
 from halfwidth.vehicle import adrift
 from halfwidth.vehicle.align import EDGE
 from halfwidth.vehicle.grid import sampled
-from halfwidth.vehicle.lapse import put_right, words
-from halfwidth.vehicle.lapses import lapses
+from halfwidth.vehicle.judged import Findings, Judged, Sensed
+from halfwidth.vehicle.lapse import words
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.sensors import STREAM, Calibration, Offset
-from halfwidth.vehicle.stamps import Stamps
 from halfwidth.vehicle.stray import strays
 
 #: The points, in order.
@@ -108,47 +107,42 @@ def fill_line(log: Log) -> str:
     return f"halfwidth fill {shlex.quote(source)} -o track.gpx"
 
 
-def far_clock(log: Log) -> tuple[Item, Log]:
-    """Look for a clock of the sensors that is far off; return the log with them moved."""
+def far_clock(log: Log, first: Sensed) -> Item:
+    """Say whether the clock of the sensors is far off."""
     if (reason := silent(log, "speed_mps")) is not None:
-        return Item("sensor clock", "not checked", reason), log
-    seconds = adrift.adrift(log)
-    if seconds is None:
+        return Item("sensor clock", "not checked", reason)
+    if first.far is None:
         text = f"speed and fixes are within {adrift.NEAR:g} s of each other as far as stops and starts tell"
-        return Item("sensor clock", "ok", text, 0.0, "s"), log
-    said = adrift.words(seconds).removesuffix(": moved")
-    item = Item("sensor clock", "bad", f"{said}; fill moves them", seconds, "s", fill_line(log))
-    return item, adrift.moved(log, seconds)
+        return Item("sensor clock", "ok", text, 0.0, "s")
+    said = adrift.words(first.far).removesuffix(": moved")
+    return Item("sensor clock", "bad", f"{said}; fill moves them", first.far, "s", fill_line(log))
 
 
-def lapsing(log: Log) -> tuple[Item, Log]:
-    """Look for stretches in which speed or yaw rate contradict the fixes; return the log with them put right."""
-    if (reason := silent(log, "speed_mps", "yaw_rate_radps")) is not None:
-        return Item("lapses", "not checked", reason), log
-    found = lapses(log)
-    if not found:
-        return Item("lapses", "ok", "no stretch of the speed or yaw rate contradicts the fixes by a factor", 0.0), log
-    said = "; ".join(words(log, found)).replace(": put right", "").replace(": not used", "")
-    item = Item("lapses", "bad", said, float(len(found)), line=fill_line(log))
-    return item, put_right(log, found)
+def lapsing(first: Sensed) -> Item:
+    """Say in which stretches speed or yaw rate contradict the fixes."""
+    if (reason := silent(first.clocked, "speed_mps", "yaw_rate_radps")) is not None:
+        return Item("lapses", "not checked", reason)
+    if not first.lapses:
+        return Item("lapses", "ok", "no stretch of the speed or yaw rate contradicts the fixes by a factor", 0.0)
+    said = "; ".join(words(first.clocked, first.lapses)).replace(": put right", "").replace(": not used", "")
+    return Item("lapses", "bad", said, float(len(first.lapses)), line=fill_line(first.clocked))
 
 
-def items(log: Log, known: Calibration, stamps: Stamps | None = None) -> list[Item]:
+def items(judged: Judged, found: Findings | None = None) -> list[Item]:
     """Give a verdict on each point.
 
     Parameters
     ----------
-    log : Log
-    known : Calibration
-        Of this log.
-    stamps : Stamps, optional
-        How its rows were moved, so that times are named as written.
+    judged : Judged
+    found : Findings, optional
+        What `fill` found in this log.
 
     Returns
     -------
     list of Item
         In the order of `NAMES`.
     """
+    log, known = judged.log, judged.sensors
     return [
         *(_clock(log, known, name) for name in STREAM),
         _scale(log, known),
@@ -157,7 +151,7 @@ def items(log: Log, known: Calibration, stamps: Stamps | None = None) -> list[It
         _standstill(log, known),
         _slip(known),
         _fix_error(known),
-        _strays(log, known, stamps),
+        _strays(judged, found),
     ]
 
 
@@ -263,18 +257,18 @@ def _fix_error(known: Calibration) -> Item:
     return Item("fix error", "ok", text, quick, "m", evidence=dict(known.noise))
 
 
-def _strays(log: Log, known: Calibration, stamps: Stamps | None) -> Item:
+def _strays(judged: Judged, found: Findings | None) -> Item:
+    log, known = judged.log, judged.sensors
     if not known.noise or not {"speed", "yaw_rate"} <= set(known.offsets):
         return Item("stray fixes", "not checked", "it needs speed, yaw rate and fixes that agree with them")
-    grid = sampled(log, sensors=known)
-    found = strays(grid, known)
-    if stamps is not None:
-        grid = replace(grid, t=stamps.back(grid.t))
-    if not found.at.size:
+    grid = sampled(log, sensors=known) if found is None else found.grid
+    stray = strays(grid, known) if found is None else found.stray
+    grid = replace(grid, t=judged.stamps.back(grid.t))
+    if not stray.at.size:
         return Item("stray fixes", "ok", "no fix lies where the vehicle cannot have been", 0.0)
-    shown = {"times": grid.t[found.at].tolist(), "off_m": found.size.tolist()}
-    text = found.words(grid).replace(" and is left out", "").replace(" and are left out", "")
-    return Item("stray fixes", "warn", f"{text}; fill leaves them out", float(found.at.size), "", fill_line(log), shown)
+    shown = {"times": grid.t[stray.at].tolist(), "off_m": stray.size.tolist()}
+    text = stray.words(grid).replace(" and is left out", "").replace(" and are left out", "")
+    return Item("stray fixes", "warn", f"{text}; fill leaves them out", float(stray.at.size), "", fill_line(log), shown)
 
 
 def _number(value: float) -> float | None:

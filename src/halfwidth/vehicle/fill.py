@@ -28,26 +28,20 @@ from numpy.typing import NDArray
 
 from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle import proven, widening
-from halfwidth.vehicle.adrift import adrift, moved
-from halfwidth.vehicle.adrift import words as adrift_words
-from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.choice import Answers, estimated
 from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, with_limits
 from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.grid import Grid, sampled
-from halfwidth.vehicle.lapse import put_right
-from halfwidth.vehicle.lapse import words as lapse_words
-from halfwidth.vehicle.lapses import lapses
+from halfwidth.vehicle.judged import Findings, judged, sensed
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path
-from halfwidth.vehicle.pieces import CONTEXT, Piece, pieces_of, spans_of, wanted_rows, with_pauses_filled
+from halfwidth.vehicle.pieces import CONTEXT, Piece, pieces_of, spans_of, wanted_rows
 from halfwidth.vehicle.roads import roads_of
 from halfwidth.vehicle.rows import counted
 from halfwidth.vehicle.running import FEWEST, top_speed
 from halfwidth.vehicle.sensors import Calibration
-from halfwidth.vehicle.spikes import spikes
-from halfwidth.vehicle.stamps import Stamps, restamped
+from halfwidth.vehicle.stamps import Stamps
 from halfwidth.vehicle.stray import strays
 from halfwidth.vehicle.track import Track, gaps_of, since_fix_of
 from halfwidth.vehicle.units import azimuth_put_right
@@ -166,6 +160,7 @@ def fill(
         native=native,
         proven=band,
         slow_m=None if answers.slow is None else answers.slow.at(t),
+        found=ready.found,
     )
 
 
@@ -188,6 +183,8 @@ class Prepared:
         Rows of the log that a track has.
     quality : (M,) array
         Quality of each.
+    found : Findings or None
+        What was found in the log, if nothing of it was told.
     """
 
     log: Log
@@ -198,6 +195,7 @@ class Prepared:
     pieces: list[Piece]
     wanted: NDArray[np.intp]
     quality: NDArray[np.str_]
+    found: Findings | None
 
     @property
     def t(self) -> Floats:
@@ -216,41 +214,29 @@ def prepared(
     """Make a log ready to be filled, whatever the method; parameters and errors as for `fill`."""
     if not log.fixed.any():
         raise BadLog("the log has no fix, at least one position is expected", hint="halfwidth check LOG")
+    first = sensed(log, clock=offset is None, distrust=distrust)
+    messages.extend(first.messages)
+    log = first.log
     if distrust:
-        leaps = spikes(log)
-        messages.extend(leaps.words(log))
-        log = leaps.masked(log)
-    far = adrift(log) if offset is None else None
-    if far is not None:
-        messages.append(adrift_words(far))
-        log = moved(log, far)
-    if distrust:
-        lapsed = lapses(log)
-        messages.extend(lapse_words(log, lapsed))
-        log = put_right(log, lapsed)
         log, said = azimuth_put_right(log)
         messages.extend([f"{said}: put right"] if said else [])
         # stray fixes show best against speed and yaw rate, later
-        sensed = all(np.isfinite(getattr(log, name)).any() for name in ("speed_mps", "yaw_rate_radps"))
-        doubtful = distrusted(log, jumps=not sensed)
+        whole = all(np.isfinite(getattr(log, name)).any() for name in ("speed_mps", "yaw_rate_radps"))
+        doubtful = distrusted(log, jumps=not whole)
         messages.extend(doubtful.words(log))
         log = doubtful.masked(log)
-    # a second antenna's log is on the clock of the first one as written
-    stamps = Stamps(log.t, log.t)
-    if second is None:
-        log, stamps = restamped(log)
-    messages.extend(filter(None, [stamps.words()]))
-    log = with_pauses_filled(log, messages)
-    sensors = calibrated(log, clock_offset=offset)
-    messages.extend(sensors.words())
-    grid = sampled(log, sensors=sensors, second=second)
-    seen = grid.seen
+    then = judged(log, offset=offset, stamped=second is not None)
+    messages.extend(then.messages)
+    log = then.log
+    grid = sampled(log, sensors=then.sensors, second=second)
+    seen, found = grid.seen, None
     if distrust:
-        stray = strays(grid, sensors)
+        stray = strays(grid, then.sensors)
         messages.extend(filter(None, [stray.words(grid)]))
+        found = Findings(first, then, grid, stray) if offset is None and second is None else None
         grid = stray.masked(grid)
     wanted, quality = wanted_rows(log)
-    return Prepared(log, stamps, sensors, grid, seen, pieces_of(grid, log), wanted, quality)
+    return Prepared(log, then.stamps, then.sensors, grid, seen, pieces_of(grid, log), wanted, quality, found)
 
 
 def _proven(

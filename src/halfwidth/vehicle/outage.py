@@ -8,8 +8,10 @@ apart, inside the interval at `level` of a method that claims one: its own inter
 hiding fixes shows. `held` is the share inside once each outage's interval is sized by the other outages of its length
 that do not overlap with it, as `fill` sizes gaps by stretches elsewhere in the log.
 
-Clocks and scales of the sensors are found from the whole log, hidden fixes included: a handful of numbers. A log that
-was written late is put right before (`stamps`), and a fix counts at the time at which it was taken.
+Clocks and scales of the sensors are found from the whole log, hidden fixes included: a handful of numbers. Speeds and
+yaw rates that leap away or contradict the fixes for a while are put right or left out before, as `fill` does
+(`judged`), for no method is made for them; fixes count as they are. A log that was written late is put right as well
+(`stamps`), and a fix counts at the time at which it was taken.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,10 +26,12 @@ from halfwidth.errors import BadLog, BadValue
 from halfwidth.vehicle.align import calibrated
 from halfwidth.vehicle.estimators import METHODS, Method, method, usable
 from halfwidth.vehicle.grid import Grid, sampled
+from halfwidth.vehicle.judged import sensed
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.outage_table import Cell, Outages
 from halfwidth.vehicle.path import Path, sized
 from halfwidth.vehicle.stamps import restamped
+from halfwidth.vehicle.units import azimuth_put_right
 
 Floats = NDArray[np.float64]
 
@@ -100,7 +104,10 @@ def outages(
         raise BadValue(f"`starts` is {starts!r}, a whole number from 1 is expected", hint="starts=20")
     level = level_of(level)
     offset = None if clock_offset is None else clock_offset_of(clock_offset)
-    drive_log: Log = restamped(as_log(log)[0])[0]
+    first = sensed(as_log(log)[0], clock=offset is None)
+    put_right, said = azimuth_put_right(first.log)
+    messages = (*first.messages, *([f"{said}: put right"] if said else []))
+    drive_log: Log = restamped(put_right)[0]
     chosen = [method(name) for name in (METHODS if methods is None else methods)]
     sensors = calibrated(drive_log, clock_offset=offset)
     drive = sampled(drive_log, sensors=sensors)
@@ -132,7 +139,9 @@ def outages(
         progress(1.0, "done")
     given_offset = float("nan") if offset is None else offset
     known = MappingProxyType(sensors.to_dict())
-    return Outages(drive_log.source, tuple(cells), level, seed, given_offset, MappingProxyType(skipped), known)
+    return Outages(
+        drive_log.source, tuple(cells), level, seed, given_offset, MappingProxyType(skipped), known, messages
+    )
 
 
 def _starts(drive: Grid, length: float, n: int, seed: int) -> Floats:

@@ -139,6 +139,8 @@ class Outages:
         Methods and lengths that could not be tried, and why.
     sensors : mapping
         What was found of the sensors and applied, see `Calibration.to_dict`.
+    messages : tuple of str
+        What was put right or left out of the log before.
     """
 
     source: str
@@ -148,6 +150,7 @@ class Outages:
     clock_offset: float
     skipped: Mapping[str, str] = field(default_factory=dict)
     sensors: Mapping[str, Any] = field(default_factory=dict)
+    messages: tuple[str, ...] = ()
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -245,7 +248,7 @@ class Outages:
 
     def _notes(self) -> list[str]:
         errors = [c.mean_se / c.mean for c in self.cells if c.n > 1 and c.mean > 0]
-        notes = [f"{what}: {why}" for what, why in self.skipped.items()]
+        notes = [*self.messages, *(f"{what}: {why}" for what, why in self.skipped.items())]
         notes += [
             f"{c.method} at {c.length:g} s found no path in {c.failed} of {c.n} outages: straight line counted"
             for c in self.cells
@@ -363,6 +366,7 @@ class Outages:
             "seed": self.seed,
             "clock_offset": _plain(self.clock_offset),
             "sensors": dict(self.sensors),
+            "messages": list(self.messages),
             "tolerance_m": TOLERANCE,
             "longest_within_s": self.within(),
             "skipped": dict(self.skipped),

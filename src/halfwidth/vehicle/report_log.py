@@ -45,7 +45,7 @@ class Section:
 
 def section(track: Track) -> Section:
     """Say what is wrong with the log of a track, and what its reader did about it."""
-    found = check(track.log)
+    found = check(track.log, track.found)
     shown = _pictures(found)
     drawn = (
         f"<details><summary>What this rests on, in {markup.count(len(shown.titles), 'picture')}</summary>{shown.html}"

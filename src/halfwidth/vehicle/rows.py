@@ -28,6 +28,9 @@ _ROUND = ((86_400.0, "day"), (604_800.0, "week"), (2**32 * 1e-3, "count of ms"),
 #: Seconds from its end, and from its beginning, that a clock that begins anew is seen in.
 _TURN = 60.0
 
+#: Sorted rows of a clock that began anew have first and last next to each other, so many usual steps apart at most.
+_NEXT = 3.0
+
 #: Rows are shuffled if so many go back in time, and if so many come at the usual rate once they are sorted.
 _DISORDER, _REGULAR = 0.3, 0.8
 
@@ -136,6 +139,10 @@ class Rows:
             ends = np.sort(np.column_stack((self.t[turns], self.t[turns + 1])), axis=1)
             if not turns.size or highest > period or ends[:, 0].max() > _TURN or ends[:, 1].min() < period - _TURN:
                 continue
+            if (step >= 0).all():  # somebody sorted a drive over midnight, or it pauses for a day
+                usual = np.median(np.delete(step, turns)) if step.size > turns.size else 0.0
+                if self.t[0] + period - highest > _NEXT * usual:
+                    continue
             count = np.zeros(self.t.size)
             count[turns + 1] = -np.sign(step[turns])
             self.t = self.t + period * np.cumsum(count)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import os
     from datetime import datetime
 
+    from halfwidth.vehicle.judged import Findings
     from halfwidth.vehicle.proven import Proven
 
 Floats = NDArray[np.float64]
@@ -133,6 +134,8 @@ class Track:
         around a row share. The half-widths say where the receiver would have seen the vehicle; they do not have it.
     proven : Proven, optional
         A band of its own from declared half-widths, in columns of its own; never part of the half-widths.
+    found : Findings, optional
+        What was found in the log, so that a report need not look for it again.
 
     Raises
     ------
@@ -163,6 +166,7 @@ class Track:
     native: str = "pandas"
     proven: "Proven | None" = None
     slow_m: Floats | None = None
+    found: "Findings | None" = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         t = _column("t_s", self.t_s, None)
