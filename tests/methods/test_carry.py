@@ -152,6 +152,15 @@ def test_a_power_and_a_line_are_a_gamma_law():
     np.testing.assert_allclose(widths["sd"], 0.005, rtol=0.2)
 
 
+@pytest.mark.parametrize(("rows", "power"), [(0.0, 0.4), (20.0, 0.4), (100.0, 0.1), (1e9, 0.0)])
+def test_the_prior_is_a_power_that_fades_with_the_rows_known(rows, power):
+    # Nothing is seen: s has the law s^(4 + power - 1) exp(-40 s) that is given beside the prior.
+    blind = hw.Record(np.arange(1.0, 5.0), np.full((4, 2), np.nan))
+    known = Known(np.full(5, -40.0), np.zeros((5, 5)), np.full(5, 4.0), rows)
+    found = hw.Posterior(nodes=512).answer(system(UNKNOWN, UNKNOWN), blind, known=known).widths[0, :3]
+    np.testing.assert_allclose(found, (4.0 + power) / 40.0, rtol=0.01)
+
+
 def test_a_power_beside_a_growing_gaussian_is_no_power():
     grows = np.array([[-60.0]])
     pull, precision, power = _core.ep_taken(np.array([True]), np.ones(1), np.ones(1), grows, np.array([100.0]))

@@ -64,6 +64,8 @@ class Known:
     Parameters
     ----------
     pull, precision, power : (p,), (p, p), (p,) arrays
+    rows : float
+        Rows that it is known from.
 
     Attributes
     ----------
@@ -71,17 +73,19 @@ class Known:
         All of it, one after the other.
     """
 
-    __slots__ = ("values",)
+    __slots__ = ("rows", "values")
+    rows: float
     values: Array
 
-    def __init__(self, pull: Array, precision: Array, power: Array) -> None:
+    def __init__(self, pull: Array, precision: Array, power: Array, rows: float = 0.0) -> None:
+        self.rows = rows
         self.values = np.concatenate((pull, np.ravel(precision), power), dtype=float)
 
     @classmethod
-    def of(cls, values: Array) -> "Known":
+    def of(cls, values: Array, rows: float = 0.0) -> "Known":
         """Wrap what the core found."""
         known = object.__new__(cls)
-        known.values = values
+        known.rows, known.values = rows, values
         return known
 
     @classmethod
@@ -196,7 +200,8 @@ class Carried:
             self.rows += 1.0
         self.given = None
         if self.rows:
-            self.given = Known.of(gone - condition(rows + self.rows) * (kept_in + self.inside.values))
+            alone = kept_in + self.inside.values
+            self.given = Known.of(gone - condition(rows + self.rows) * alone, self.rows)
         return self.given
 
     def leave(self, a: int) -> None:
