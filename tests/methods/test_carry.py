@@ -154,11 +154,12 @@ def test_a_power_and_a_line_are_a_gamma_law():
 
 @pytest.mark.parametrize(("rows", "power"), [(0.0, 0.4), (20.0, 0.4), (100.0, 0.1), (1e9, 0.0)])
 def test_the_prior_is_a_power_that_fades_with_the_rows_known(rows, power):
-    # Nothing is seen: s has the law s^(4 + power - 1) exp(-40 s) that is given beside the prior.
-    blind = hw.Record(np.arange(1.0, 5.0), np.full((4, 2), np.nan))
-    known = Known(np.full(5, -40.0), np.zeros((5, 5)), np.full(5, 4.0), rows)
-    found = hw.Posterior(nodes=512).answer(system(UNKNOWN, UNKNOWN), blind, known=known).widths[0, :3]
-    np.testing.assert_allclose(found, (4.0 + power) / 40.0, rtol=0.01)
+    # Nothing is seen: q has the law q^(4 + power - 1) exp(-40 q) that is given beside the prior.
+    model = hw.Linear([[0.5]], None, [[1]], hw.Uniform.unknown(at_most=5.0), hw.Uniform(0.5), hw.Box(-1, 1))
+    blind = hw.Record(np.arange(1.0, 5.0), np.full((4, 1), np.nan))
+    known = Known(np.full(2, -40.0), np.zeros((2, 2)), np.full(2, 4.0), rows)
+    found = hw.Posterior(nodes=128).answer(model, blind, known=known).widths[0, 0]
+    assert found == pytest.approx((4.0 + power) / 40.0, rel=0.02)
 
 
 def test_a_power_beside_a_growing_gaussian_is_no_power():
