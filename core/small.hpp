@@ -168,16 +168,16 @@ inline bool all_finite(N n, const double* a) {
 
 // ---- products: C (m,n) =, +=, -= ... -------------------------------------------------------------------------------
 
-// C (m,n) op A (m,k) B (k,n)
-template <Op op = Op::set, class M, class K, class N>
-inline void mul(M m, K k, N n, const double* A, const double* B, double* C) {
+// C (m,n) op A (m,k) B (k,n), where entry (i,l) of A stands at A[i * down + l * right]
+template <Op op, class M, class K, class N, class Down, class Right>
+inline void mul_strided(M m, K k, N n, const double* A, Down down, Right right, const double* B, double* C) {
     if constexpr (N::fixed) {
         constexpr int c = N::cap;
         for (int i = 0; i < m; i++) {
             Row<c> s = op == Op::set ? Row<c>::zero() : Row<c>::load(C + i * c);
             for (int l = 0; l < k; l++) {
-                if constexpr (op == Op::sub) s.axmy(A[i * k + l], Row<c>::load(B + l * c));
-                else s.axpy(A[i * k + l], Row<c>::load(B + l * c));
+                if constexpr (op == Op::sub) s.axmy(A[i * down + l * right], Row<c>::load(B + l * c));
+                else s.axpy(A[i * down + l * right], Row<c>::load(B + l * c));
             }
             s.store(C + i * c);
         }
@@ -186,7 +186,7 @@ inline void mul(M m, K k, N n, const double* A, const double* B, double* C) {
             double* __restrict c = C + static_cast<std::ptrdiff_t>(i) * n;
             if (op == Op::set) for (int j = 0; j < n; j++) c[j] = 0.0;
             for (int l = 0; l < k; l++) {
-                const double s = op == Op::sub ? -A[i * k + l] : A[i * k + l];
+                const double s = op == Op::sub ? -A[i * down + l * right] : A[i * down + l * right];
                 const double* __restrict b = B + static_cast<std::ptrdiff_t>(l) * n;
                 for (int j = 0; j < n; j++) c[j] += s * b[j];
             }
@@ -194,30 +194,16 @@ inline void mul(M m, K k, N n, const double* A, const double* B, double* C) {
     }
 }
 
+// C (m,n) op A B, A (m,k), B (k,n)
+template <Op op = Op::set, class M, class K, class N>
+inline void mul(M m, K k, N n, const double* A, const double* B, double* C) {
+    mul_strided<op>(m, k, n, A, k, Dim<1>(), B, C);
+}
+
 // C (m,n) op A' B, A (k,m), B (k,n)
 template <Op op = Op::set, class M, class K, class N>
 inline void mul_tn(M m, K k, N n, const double* A, const double* B, double* C) {
-    if constexpr (N::fixed) {
-        constexpr int c = N::cap;
-        for (int i = 0; i < m; i++) {
-            Row<c> s = op == Op::set ? Row<c>::zero() : Row<c>::load(C + i * c);
-            for (int l = 0; l < k; l++) {
-                if constexpr (op == Op::sub) s.axmy(A[l * m + i], Row<c>::load(B + l * c));
-                else s.axpy(A[l * m + i], Row<c>::load(B + l * c));
-            }
-            s.store(C + i * c);
-        }
-    } else {
-        for (int i = 0; i < m; i++) {
-            double* __restrict c = C + static_cast<std::ptrdiff_t>(i) * n;
-            if (op == Op::set) for (int j = 0; j < n; j++) c[j] = 0.0;
-            for (int l = 0; l < k; l++) {
-                const double s = op == Op::sub ? -A[l * m + i] : A[l * m + i];
-                const double* __restrict b = B + static_cast<std::ptrdiff_t>(l) * n;
-                for (int j = 0; j < n; j++) c[j] += s * b[j];
-            }
-        }
-    }
+    mul_strided<op>(m, k, n, A, Dim<1>(), m, B, C);
 }
 
 // C (m,n) op A B', A (m,k), B (n,k)

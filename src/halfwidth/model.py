@@ -6,7 +6,6 @@ correlated (Pavelková and Kárný 2013, eqs. 1 and 2); absent means identity.
 """
 
 import dataclasses
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from halfwidth.array import Array, Function, real
+from halfwidth.call import arity, called, takes_step_second
 from halfwidth.derivative import differences
 from halfwidth.errors import BadShape, BadValue, Refused
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform
@@ -253,14 +253,14 @@ class Nonlinear:
         mean = np.atleast_1d(self.x0.mean)
         nx = len(mean)
         put(self, "nx", nx)
-        if _takes_step_second(self.g):
+        if takes_step_second(self.g):
             raise BadValue(
                 "the second argument of `g` is called `dt`, but it is the input", hint="g = lambda x, u, dt: ..."
             )
         moved = self.move(mean, np.zeros(self.nu) if self.nu else None, float(self.dt))
         if moved.shape != (nx,):
             raise BadShape(f"`g` returned shape {moved.shape}, ({nx},) was expected from `x0`")
-        seen = _called(self.h, "h", (mean.copy(),))
+        seen = called(self.h, "h", (mean.copy(),))
         if seen.ndim != 1:
             raise BadShape(f"`h` returned shape {seen.shape}, a vector (ny,) was expected")
         put(self, "ny", len(seen))
@@ -282,11 +282,11 @@ class Nonlinear:
         BadValue
             If `g` fails or returns something that is not finite and real.
         """
-        return _called(self.g, "g", (x.copy(), u, dt)[: arity(self.g, 3)])
+        return called(self.g, "g", (x.copy(), u, dt)[: arity(self.g, 3)])
 
     def output(self, x: Array) -> Array:
         """Return ``h(x)``, (ny,)."""
-        return _called(self.h, "h", (x.copy(),))
+        return called(self.h, "h", (x.copy(),))
 
     def linearise(
         self, x: ArrayLike, u: ArrayLike | None = None, dt: float | None = None, *, by: str | None = None
@@ -361,12 +361,12 @@ class Nonlinear:
         by: str | None,
     ) -> tuple[Array, Array]:
         user = getattr(self, f"{name}_x")
-        value = _called(f, name, (x.copy(), *more))
+        value = called(f, name, (x.copy(), *more))
         if by == "user" and user is None:
             raise BadValue(f"`by` is 'user' but the model has no `{name}_x`", hint="Nonlinear(..., g_x=..., h_x=...)")
         if user is not None and by in (None, "user"):
             wanted = arity(user, 3 if name == "g" else 1)
-            slope = np.atleast_2d(_called(user, f"{name}_x", (x.copy(), *more)[:wanted]))
+            slope = np.atleast_2d(called(user, f"{name}_x", (x.copy(), *more)[:wanted]))
             if slope.shape != (size, self.nx):
                 raise BadShape(f"`{name}_x` returned shape {slope.shape}, ({size}, {self.nx}) was expected")
             return value, slope
@@ -379,7 +379,7 @@ class Nonlinear:
                     raise BadValue(f"`{name}` cannot be compiled: {reason}", hint="by='differences'") from reason
             else:
                 return value, tape.jacobian(x, *more)[1][0]
-        return value, differences(lambda at: _called(f, name, (at, *more)), x, angles=angles)
+        return value, differences(lambda at: called(f, name, (at, *more)), x, angles=angles)
 
     def as_gaussian(self) -> "Nonlinear":
         """Return the model with Gaussian noise of the same covariances; see `Linear.as_gaussian`."""
@@ -400,40 +400,6 @@ def needs_a_box(model: Model, name: str) -> str | None:
             "\nhint: bounds=Box(lo, hi), or a Gaussian model and Constrained()"
         )
     return None
-
-
-def arity(function: Callable[..., Any], most: int) -> int:
-    """Return how many positional arguments `function` takes, at most `most`."""
-    if isinstance(function, np.ufunc):
-        return min(function.nin, most)
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return 1
-    if any(p.kind is p.VAR_POSITIONAL for p in parameters):
-        return most
-    return min(
-        most,
-        sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty for p in parameters),
-    )
-
-
-def _takes_step_second(function: Callable[..., Any]) -> bool:
-    try:
-        return list(inspect.signature(function).parameters)[1:2] == ["dt"]
-    except (TypeError, ValueError):
-        return False
-
-
-def _called(function: Callable[..., Any], name: str, arguments: tuple[Any, ...]) -> Array:
-    try:
-        value = function(*arguments)
-    except Exception as exc:
-        raise BadValue(
-            f"`{name}` failed with {type(exc).__name__}: {exc}",
-            hint=f"call {name}({', '.join(np.array2string(np.asarray(a)) for a in arguments)})",
-        ) from exc
-    return np.atleast_1d(real(value, f"{name}(...)"))
 
 
 def _common(

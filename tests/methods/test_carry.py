@@ -241,18 +241,25 @@ def test_a_snapshot_holds_what_is_carried(memory):
 
 
 def test_rows_that_fit_nothing_do_not_poison_what_is_known():
-    _, record = drawn(80, 8)
-    y = record.y.copy()
-    y[30] = 1e6
+    # Poison would lead every seed to the cap of 1, 0.7 away. Nine windows lost of 80 rows move half-widths by a few
+    # hundredths, a tenth of what 80 rows leave open. The median, since a window of 8 rows goes astray in one seed of
+    # twenty, with the row or without.
     capped = system(hw.Uniform.unknown(at_most=1.0), hw.Uniform.unknown(at_most=1.0))
-    est = hw.estimate(capped, hw.Record(record.t, y), hw.Window(hw.Posterior(nodes=8), memory=8))
-    good = np.array([s.good for s in est.info["statuses"]])
-    assert not good[30]
-    assert good[-1]
-    assert np.isfinite(est.x).all()
-    y[30] = np.nan
-    other = hw.estimate(capped, hw.Record(record.t, y), hw.Window(hw.Posterior(nodes=8), memory=8))
-    np.testing.assert_allclose(np.r_[est.q, est.r], np.r_[other.q, other.r], atol=0.15)
+    method = hw.Window(hw.Posterior(nodes=32), memory=8)
+    away = []
+    for seed in range(10):
+        _, record = drawn(80, seed)
+        found = []
+        for y in (1e6, np.nan):
+            spoiled = record.y.copy()
+            spoiled[30] = y
+            found.append(hw.estimate(capped, hw.Record(record.t, spoiled), method))
+        bad, missing = found
+        good = np.array([s.good for s in bad.info["statuses"]])
+        assert np.flatnonzero(~good).tolist() == list(range(30, 39))
+        assert np.isfinite(bad.x).all()
+        away.append(np.abs(np.r_[bad.q, bad.r] - np.r_[missing.q, missing.r]).max())
+    assert np.median(away) < 0.05
 
 
 @pytest.mark.parametrize("recall", [-1.0, np.inf, np.nan])

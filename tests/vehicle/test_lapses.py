@@ -8,7 +8,8 @@ from tests.vehicle.test_faults import in_gaps
 
 from halfwidth.vehicle import check, fill, simulate_drive
 from halfwidth.vehicle.formats import read
-from halfwidth.vehicle.lapses import lapses, put_right, words
+from halfwidth.vehicle.lapse import put_right, words
+from halfwidth.vehicle.lapses import lapses
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.spikes import spikes
 

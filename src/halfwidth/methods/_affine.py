@@ -14,9 +14,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from halfwidth.array import Array
+from halfwidth.call import arity
 from halfwidth.enclosure import affine
 from halfwidth.methods._bounds import Rows, down, up
-from halfwidth.model import Nonlinear, arity
+from halfwidth.model import Nonlinear
 from halfwidth.noise import Uniform
 from halfwidth.record import Record
 from halfwidth.spread import Box

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from halfwidth.array import Array, wrapped
+from halfwidth.call import arity
 from halfwidth.methods._residuals import half_width_bounds, reference, residuals
-from halfwidth.model import Entry, Linear, Model, Nonlinear, arity
+from halfwidth.model import Entry, Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.solvers.banded import solve

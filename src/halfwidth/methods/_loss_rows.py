@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.array import Array
+from halfwidth.call import arity
 from halfwidth.derivative import differences
 from halfwidth.loss import Loss
 from halfwidth.methods._loss_modes import Modes, modes_of
-from halfwidth.model import Linear, Nonlinear, arity
+from halfwidth.model import Linear, Nonlinear
 from halfwidth.record import Record
 
 

@@ -16,16 +16,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from halfwidth.array import Array, wrapped
-from halfwidth.methods._noise_parts import gaussian_part, uniform_part
-from halfwidth.methods._residuals import first_scales
-from halfwidth.model import Linear, Nonlinear, arity
-from halfwidth.noise import Gaussian
+from halfwidth.array import Array
+from halfwidth.methods._along import linearised, misfit, squares
+from halfwidth.methods._first_path import LEAST, first_path
+from halfwidth.methods._noise_parts import gaussian_part
+from halfwidth.model import Linear, Nonlinear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status
-from halfwidth.spread import Normal
-from halfwidth.tape import Untraceable
-from halfwidth.trace import compiled
 
 if TYPE_CHECKING:
     from halfwidth.methods._answer import Answer
@@ -34,14 +31,12 @@ if TYPE_CHECKING:
 
 #: A step below this share of the standard deviations ends the iteration, and one below the second is good enough.
 _CLOSE, _USABLE = 1e-3, 0.1
-#: Shares of a step that are tried, and rounds after which half-widths and nodes begin where they began before.
-_SHARES, _SETTLED = (1.0, 0.5, 0.25, 0.125), 2
+#: Shares of a step that are tried.
+_SHARES = (1.0, 0.5, 0.25, 0.125)
+#: Rounds after which half-widths and nodes begin where they began before.
+_SETTLED = 2
 #: Rounds after which a step is half of what is asked for: what still moves then goes to and fro.
 _PATIENT = 6
-#: The path of the window before stays unless another one fits so many times better.
-_BETTER = 3.0
-#: No noise counts as smaller than this share of what the data would make of it where paths are compared.
-_LEAST = 1e-3
 
 
 def relinearised(
@@ -52,7 +47,7 @@ def relinearised(
 
     `s` and `known` are as in `Posterior.answer`; `path` (T + 1, nx), x0 first, is one that may be near.
     """
-    X, scale = _first_path(model, record, path)
+    X, scale = first_path(model, record, path)
     start: Start | Array | None = s
     moved, rounds = np.inf, 0
     while True:
@@ -90,30 +85,17 @@ def _shortened(
     With bounded noise the mean is not where squares are least, so a step is not asked to be better. If none will do the
     shortest one has to.
     """
-    here, way = _misfit(model, record, X, variance), new
+    here, way = misfit(model, record, X, variance), new
     A, C, rest = linear.A.value, linear.C.value, local.u
     assert A is not None
     assert C is not None
     for share in _SHARES:
         way = X + share * (new - X)
         w = way[1:] - np.einsum("tij,tj->ti", A, way[:-1]) - rest
-        said = _squares(w, local.y - np.einsum("tij,tj->ti", C, way[1:]), variance)
-        if _misfit(model, record, way, variance) <= max(here, 2.0 * said + w.size):
+        said = squares(w, local.y - np.einsum("tij,tj->ti", C, way[1:]), variance)
+        if misfit(model, record, way, variance) <= max(here, 2.0 * said + w.size):
             break
     return way
-
-
-def _misfit(model: Nonlinear, record: Record, X: Array, variance: Array) -> float:
-    """Return the squared residuals of a path (T + 1, nx) over their variances (nx + ny,)."""
-    off, _ = _outputs(model, record, X)
-    moved, _ = _along(model, "g", X[:-1], _inputs(model, record))
-    return _squares(X[1:] - moved, off, variance)
-
-
-def _squares(w: Array, e: Array, variance: Array) -> float:
-    nx = w.shape[1]
-    total = float(np.sum(w**2 / variance[:nx])) + float(np.nansum(e**2 / variance[nx:]))
-    return total if np.isfinite(total) else np.inf
 
 
 def _found(model: Nonlinear, est: Estimate, scale: Array) -> Array:
@@ -130,97 +112,4 @@ def _found(model: Nonlinear, est: Estimate, scale: Array) -> Array:
             var[rows] += own
         elif part is not None:
             var[rows] += np.diagonal(part.cov().at(0.0, model.dt))
-    return np.maximum(var, (_LEAST * scale) ** 2)
-
-
-def linearised(model: Nonlinear, record: Record, X: Array) -> tuple[Linear, Record]:
-    """Return the model along a path (T + 1, nx), x0 first, with what is left of `g` and `h` as inputs and outputs."""
-    g, A = _along(model, "g", X[:-1], _inputs(model, record))
-    off, C = _outputs(model, record, X)
-    rest = g - np.einsum("tij,tj->ti", A, X[:-1])
-    y = off + np.einsum("tij,tj->ti", C, X[1:])
-    linear = Linear(
-        A, np.eye(model.nx), C, model.w, model.e, model.x0, bounds=model.bounds, dt=model.dt,
-        names={"x": model.names.x, "y": model.names.y},
-    )  # fmt: skip
-    return linear, Record(record.t, y, rest)
-
-
-def _inputs(model: Nonlinear, record: Record) -> tuple[Array | None, Array]:
-    return record.u if model.nu else None, record.steps(model.dt)
-
-
-def _outputs(model: Nonlinear, record: Record, X: Array) -> tuple[Array, Array]:
-    """Return outputs less those of a path (T, ny), angles wrapped, and the Jacobians of `h` along it."""
-    h, C = outputs_along(model, X[1:])
-    return wrapped(record.y - h, model.y_angles), C
-
-
-def outputs_along(model: Nonlinear, x: Array) -> tuple[Array, Array]:
-    """Return outputs (T, ny) of states x (T, nx), and the Jacobians of `h` (T, ny, nx)."""
-    return _along(model, "h", x, ())
-
-
-def _along(model: Nonlinear, name: str, X: Array, more: tuple[Array | None, ...]) -> tuple[Array, Array]:
-    """Return values and Jacobians of `g` or `h` at every point of a path, compiled where the function allows it."""
-    f = getattr(model, name)
-    given = more[: arity(f, 3 if name == "g" else 1) - 1]
-    if getattr(model, f"{name}_x") is None:
-        sizes = (model.nx, model.nu, None)[: 1 + len(given)]
-        try:
-            tape = compiled(f, sizes, [(X[0], *(None if a is None else a[0] for a in given))])
-            value, slope = tape.jacobian(X, *(np.zeros((len(X), 0)) if a is None else a for a in given))
-            if np.isfinite(value).all() and np.isfinite(slope).all():
-                return value, slope
-        except Untraceable:
-            pass
-    both = [
-        model.linearise(x, None if not more or more[0] is None else more[0][t], _step(more, t)) for t, x in enumerate(X)
-    ]
-    values, slopes = [getattr(b, name) for b in both], [getattr(b, f"{name}_x") for b in both]
-    return np.array(values), np.array(slopes)
-
-
-def _step(more: tuple[Array | None, ...], t: int) -> float | None:
-    return None if not more or more[1] is None else float(more[1][t])
-
-
-def _first_path(model: Nonlinear, record: Record, near: Array | None) -> tuple[Array, Array]:
-    """Return a path (T + 1, nx) and the scale of each noise (nx + ny,).
-
-    The path is that of least misfit among those of Gaussian smoothers with noise of about the right size, one by sigma
-    points and one by Jacobians, and the one that may be `near`.
-    """
-    from halfwidth.methods.nonlinear import ExtendedKalman, UnscentedKalman
-
-    x0 = np.asarray(model.x0.mean, dtype=float)
-    at = model.linearise(x0, None if record.u is None else record.u[0], model.dt)
-    local = Linear(at.g_x, None, at.h_x, model.w, model.e, Normal(x0, 1.0))
-    scale = first_scales(local, [record.y[record.seen[:, j], j] for j in range(model.ny)])
-    noises: dict[str, Gaussian] = {}
-    for name, noise, size in (("w", model.w, scale[: model.nx]), ("e", model.e, scale[model.nx :])):
-        if noise.known:
-            noises[name] = Gaussian(noise.cov())
-            continue
-        box, part = uniform_part(noise), gaussian_part(noise)
-        var = np.zeros(len(size)) if box is None else np.clip(size, box.at_least, box.at_most) ** 2 / 3.0
-        if part is not None and part.at_least is not None and part.at_most is not None:
-            var = var + np.clip(size**2, part.at_least, part.at_most)
-        noises[name] = Gaussian(var)
-    prior = model.x0
-    if not isinstance(prior, Normal):
-        wide = np.where(np.isfinite(prior.hi - prior.lo), prior.hi - prior.lo, 1e3 * scale[: model.nx])
-        prior = Normal(x0, wide**2 / 12.0)
-    gaussian = replace(model, w=noises["w"], e=noises["e"], x0=prior, bounds=None, loss=None)
-    diagonal = [np.diagonal(noises[name].cov().at(0.0, model.dt)) for name in ("w", "e")]
-    variance = np.maximum(np.concatenate(diagonal), (_LEAST * scale) ** 2)
-    best, least = np.broadcast_to(x0, (len(record) + 1, model.nx)), np.inf
-    for smoother in (UnscentedKalman(smooth=True), ExtendedKalman(smooth=True)):
-        found = smoother.run(gaussian, record)
-        X = np.concatenate([np.asarray(found.info.get("x0", x0))[None], found.x])
-        misfit = _misfit(model, record, X, variance) if np.isfinite(X).all() else np.inf
-        if misfit < least:
-            best, least = X, misfit
-    if near is not None and np.isfinite(near).all() and _misfit(model, record, near, variance) < _BETTER * least:
-        best = near
-    return best, scale
+    return np.maximum(var, (LEAST * scale) ** 2)

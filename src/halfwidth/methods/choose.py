@@ -12,10 +12,10 @@ import numpy as np
 
 from halfwidth.array import Array, generator, wrapped
 from halfwidth.errors import BadValue, Refused, hinted
+from halfwidth.methods._along import outputs_along
 from halfwidth.methods._linearised import filled
 from halfwidth.methods._noise_parts import gaussian_part, uniform_part
 from halfwidth.methods._protocol import Estimator
-from halfwidth.methods._relinearise import outputs_along
 from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status

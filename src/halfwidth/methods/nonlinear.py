@@ -22,11 +22,12 @@ import numpy as np
 
 from halfwidth import methods
 from halfwidth.array import Array
+from halfwidth.call import arity
 from halfwidth.derivative import differences
 from halfwidth.errors import BadShape, BadValue, HalfwidthError, Refused, hinted
 from halfwidth.methods._deviations import Function, Spread, scan
 from halfwidth.methods._protocol import typed
-from halfwidth.model import Linear, Model, Nonlinear, arity
+from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian, unknown_variances
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status

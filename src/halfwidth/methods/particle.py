@@ -22,9 +22,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from halfwidth.array import Array, generator
+from halfwidth.call import arity
 from halfwidth.errors import BadValue
 from halfwidth.methods._protocol import typed
-from halfwidth.model import Linear, Model, Nonlinear, arity
+from halfwidth.model import Linear, Model, Nonlinear
 from halfwidth.noise import Gaussian, Mixed, Noise, Uniform, unknown_variances
 from halfwidth.record import Record
 from halfwidth.result import Estimate, Status

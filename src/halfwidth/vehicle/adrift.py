@@ -46,7 +46,7 @@ def adrift(log: Log) -> float | None:
         Seconds to add to the stamps of the sensors; None where their clock is near, or nothing tells.
     """
     t, speed = log.stream("speed_mps")
-    chord = evidence.windows(log, max(1.0, float(np.median(np.diff(log.t[log.fixed]))) if log.fixed.sum() > 1 else 1.0))
+    chord = evidence.windows(log, evidence.baseline(log, 1.0))
     if t.size < _FEWEST or chord.start.size < _FEWEST:
         return None
     middle, pace = 0.5 * (chord.start + chord.stop), chord.distance / (chord.stop - chord.start)

@@ -8,14 +8,14 @@ log cannot tell is said to be not checked, never guessed.
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth.vehicle import check_sensors, evidence
+from halfwidth.vehicle import check_sensors, check_units, evidence
 from halfwidth.vehicle.align import calibrated, steps_of
 from halfwidth.vehicle.check_sensors import Item as Item
 from halfwidth.vehicle.distrust import NOTHING, Distrust, distrusted
@@ -23,13 +23,7 @@ from halfwidth.vehicle.log import STREAMS, Log
 from halfwidth.vehicle.sensors import Calibration
 from halfwidth.vehicle.spikes import spikes
 from halfwidth.vehicle.stamps import Stamps, delays, restamped
-from halfwidth.vehicle.units import (
-    azimuth_put_right,
-    contradicted_convention,
-    contradicted_yaw,
-    matched_factor,
-    swapped_columns,
-)
+from halfwidth.vehicle.units import azimuth_put_right, matched_factor
 
 Floats = NDArray[np.float64]
 
@@ -47,9 +41,6 @@ _COARSE = {
     "ay_mps2": (0.2, "m/s2", "0.2 m/s2"),
 }
 
-#: A way of so many metres, and of so many times as far as all fixes lie apart, is none that a car has gone in them.
-_WAY, _WAYS = 200.0, 20.0
-
 _LABEL = {
     "position": "position",
     "alt_m": "height",
@@ -59,11 +50,6 @@ _LABEL = {
     "ax_mps2": "acceleration x",
     "ay_mps2": "acceleration y",
 }
-_ROLE = {"azimuth_rad": "azimuth", "speed_mps": "speed", "yaw_rate_radps": "yaw_rate"}
-_UNIT_AS_TYPED = {"speed is in km/h": "km/h", "speed is in mph": "mph", "speed is in knots": "kn",
-                  "speed is in m/s, not km/h": "m/s", "speed is in cm/s": "cm/s",
-                  "time is in milliseconds": "ms", "time is in microseconds": "us",
-                  "time is in nanoseconds": "ns"}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +200,7 @@ def check(log: Any) -> Check:
     leaping, log = _spikes(log)
     far, log = check_sensors.far_clock(log)
     lapsing, log = check_sensors.lapsing(log)
-    swapped = _swapped(log)
+    swapped = check_units.swapped(log)
     basis = None
     if swapped.verdict == "bad":
         first = "put latitude and longitude right first"
@@ -223,7 +209,7 @@ def check(log: Any) -> Check:
     else:
         trust, doubted = _trust(log)
         believed = doubted.masked(log)
-        moving = [_outliers(believed), _speed(log), _azimuth(log), _yaw(log)]
+        moving = [_outliers(believed), check_units.speed(log), check_units.azimuth(log), check_units.yaw(log)]
         row = matched_factor(evidence.speed_ratio(log))
         if row is not None and row[3] != 1:
             first = "put the time right first"
@@ -250,19 +236,9 @@ def check(log: Any) -> Check:
     return Check(log.source, len(log), int(log.fixed.sum()), length, items, log.notes, basis)
 
 
-def _there(log: Log, name: str) -> bool:
-    return bool(np.isfinite(getattr(log, name)).any())
-
-
-def _typed(log: Log, name: str, unit: str, sign: str = "") -> str:
-    role = _ROLE.get(name, name)
-    column = log.columns.get(role, "COLUMN")
-    return f"--columns '{role}={sign}{column}[{unit}]'"
-
-
 def _streams(log: Log) -> Item:
-    there = [_LABEL[name] for name in _LABEL if name == "position" or _there(log, name)]
-    lacking = [_LABEL[name] for name in ("speed_mps", "yaw_rate_radps") if not _there(log, name)]
+    there = [_LABEL[name] for name in _LABEL if name == "position" or check_sensors.has(log, name)]
+    lacking = [_LABEL[name] for name in ("speed_mps", "yaw_rate_radps") if not check_sensors.has(log, name)]
     text = f"found {', '.join(there)}"
     if not log.fixed.any():
         return Item("streams", "bad", "there is no position", 0.0)
@@ -335,23 +311,6 @@ def _spikes(log: Log) -> tuple[Item, Log]:
     return item, found.masked(log)
 
 
-def _swapped(log: Log) -> Item:
-    name = "latitude, longitude"
-    if swapped_columns(log):
-        lat, lon = log.columns.get("lat", "COLUMN"), log.columns.get("lon", "COLUMN")
-        return Item(
-            name,
-            "bad",
-            "swapped: only so do speed and course fit the fixes",
-            line=f"--columns 'lat={lon},lon={lat}'",
-        )
-    if not log.fixed.any():
-        return Item(name, "not checked", "there is no position")
-    lat_deg, lon_deg = float(np.nanmedian(log.lat_deg)), float(np.nanmedian(log.lon_deg))
-    ns, ew = "N" if lat_deg >= 0 else "S", "E" if lon_deg >= 0 else "W"
-    return Item(name, "ok", f"around {abs(lat_deg):.4f} {ns}, {abs(lon_deg):.4f} {ew}")
-
-
 def _outliers(log: Log) -> Item:
     """Look for jumps that neither the speed nor the scatter of the fixes explains."""
     t, position = log.stream("position")
@@ -383,7 +342,7 @@ def _trust(log: Log) -> tuple[Item, Distrust]:
     n = int(log.fixed.sum())
     if n < 10:
         return Item("trust", "not checked", "too few fixes"), NOTHING
-    sensed = _there(log, "speed_mps") and _there(log, "yaw_rate_radps")
+    sensed = check_sensors.has(log, "speed_mps") and check_sensors.has(log, "yaw_rate_radps")
     found = distrusted(log, jumps=not sensed)
     if not len(found):
         return Item("trust", "ok", "no fix is frozen" + (" or jumps" * (not sensed)), 0.0), found
@@ -398,102 +357,11 @@ def _stamps(log: Log, stamps: Stamps) -> Item:
     if stamps.moved:
         late = max([float(stamps.late.max()), *(seconds for _, seconds in stamps.leaps)])
         return Item("stamps", "warn", stamps.words(), late, "s", check_sensors.fill_line(log))
-    if not _there(log, "speed_mps"):
+    if not check_sensors.has(log, "speed_mps"):
         return Item("stamps", "not checked", "there is no speed to tell when the fixes were taken")
     if not delays(log.t[log.fixed])[1]:
         return Item("stamps", "not checked", "fixes are too few, or come at no regular rate")
     return Item("stamps", "ok", "no row was written so late that fixes and speed tell", 0.0, "s")
-
-
-def _speed(log: Log) -> Item:
-    if not _there(log, "speed_mps"):
-        return Item("speed", "not checked", "there is no speed")
-    found = evidence.speed_ratio(log)
-    if not found.enough:
-        return _unmoved(log)
-    row = matched_factor(found)
-    shown = {"windows": found.n, "spread": found.spread}
-    text = f"speed is {found.value:.3f} times the distance between fixes over time"
-    if row is not None:
-        name = "speed_mps" if row[3] == 1 else "time"
-        return Item(
-            "speed", "bad", f"{text}: {row[1]}", found.value, "", _typed(log, name, _UNIT_AS_TYPED[row[1]]), shown
-        )
-    if abs(found.value - 1) > 0.1:
-        text += ", 1 is expected and no known unit explains it: another column?"
-        return Item("speed", "bad", text, found.value, "", "--columns speed=COLUMN", shown)
-    if abs(found.value - 1) > 0.04:
-        # a scale that `fill` finds
-        return Item("speed", "warn", f"{text}, 1 is expected", found.value, "", check_sensors.fill_line(log), shown)
-    return Item("speed", "ok", text, found.value, "", "", shown)
-
-
-def _unmoved(log: Log) -> Item:
-    """Judge the speed of a car whose fixes hardly move: it stands, or they are no positions."""
-    t, speed = log.stream("speed_mps")
-    way = float(np.sum(np.diff(t) * np.abs(speed[:-1])))
-    fixed = log.fixed
-    east, north = evidence.local_metres(log.lat_deg[fixed], log.lon_deg[fixed])
-    wide = float(np.hypot(np.ptp(east), np.ptp(north))) if east.size else 0.0
-    if way < _WAY or way < _WAYS * wide:
-        return Item("speed", "not checked", "the car hardly moves between fixes")
-    text = f"the speed adds up to {way:,.0f} m while all fixes lie within {wide:.3g} m"
-    as_degrees = log
-    if np.abs(log.lat_deg[fixed]).max() <= np.pi / 2 and np.abs(log.lon_deg[fixed]).max() <= np.pi:
-        as_degrees = replace(log, lat_deg=np.degrees(log.lat_deg), lon_deg=np.degrees(log.lon_deg))
-    turned = evidence.speed_ratio(as_degrees)
-    if turned.enough and abs(np.log(max(turned.value, 1e-9))) < 0.2:
-        lat, lon = (log.columns.get(role, "COLUMN") for role in ("lat", "lon"))
-        line = f"--columns 'lat={lat}[rad],lon={lon}[rad]'"
-        return Item("speed", "bad", f"{text}: positions are in radians", way, "m", line)
-    line = "--columns lat=COLUMN,lon=COLUMN"
-    return Item("speed", "bad", f"{text}: are these the columns of the position?", way, "m", line)
-
-
-def _azimuth(log: Log) -> Item:
-    if not _there(log, "azimuth_rad"):
-        return Item("azimuth", "not checked", "there is no azimuth")
-    ours = evidence.course_errors(log)["radians clockwise from north"]
-    if not ours.enough:
-        return Item("azimuth", "not checked", "the car hardly moves between fixes")
-    degrees = float(np.degrees(ours.value))
-    shown = {"windows": ours.n, "spread": float(np.degrees(ours.spread))}
-    text = f"azimuth and course between fixes differ by {degrees:.1f} degrees in the middle"
-    convention = contradicted_convention(log)
-    if convention is not None:
-        degrees_given = convention.startswith("degrees")
-        line = check_sensors.fill_line(log)  # which turns what is counted from east
-        if convention.endswith("clockwise from north"):
-            sign = "-" if "counter" in convention else ""
-            line = _typed(log, "azimuth_rad", "deg" if degrees_given else "rad", sign)
-        return Item("azimuth", "bad", f"{text}: it is in {convention}", degrees, "deg", line, shown)
-    if degrees > 20:
-        text += ", no known convention explains it: another column?"
-        return Item("azimuth", "bad", text, degrees, "deg", "--columns azimuth=COLUMN", shown)
-    if degrees > 6:
-        return Item("azimuth", "warn", text, degrees, "deg", "", shown)
-    return Item("azimuth", "ok", text, degrees, "deg", "", shown)
-
-
-def _yaw(log: Log) -> Item:
-    if not _there(log, "yaw_rate_radps"):
-        return Item("yaw rate", "not checked", "there is no yaw rate")
-    found = evidence.turning(log)
-    if not found.enough:
-        return Item("yaw rate", "not checked", "the car hardly turns between fixes", None)
-    shown = {"turns": found.n, "correlation": found.correlation}
-    text = f"the course changes {found.slope:.3f} times as much as the yaw rate says"
-    factor = contradicted_yaw(found)
-    if factor is not None:
-        unit = "deg/s" if abs(factor) < 0.5 else "rad/s"
-        wrong = [] if abs(factor) == 1 else [f"it is in {unit}"]
-        wrong += ["its sign is that of a turn to the right"] if factor < 0 else []
-        line = _typed(log, "yaw_rate_radps", unit, "-" if factor < 0 else "")
-        return Item("yaw rate", "bad", f"{text}: {' and '.join(wrong)}", found.slope, "", line, shown)
-    if abs(found.slope - 1) > 0.25:
-        text += ", 1 is expected: another column?"
-        return Item("yaw rate", "warn", text, found.slope, "", "--columns yaw_rate=COLUMN", shown)
-    return Item("yaw rate", "ok", text, found.slope, "", "", shown)
 
 
 def _steps(log: Log, found: Mapping[str, float]) -> list[Item]:

@@ -13,7 +13,8 @@ import numpy as np
 from halfwidth.vehicle import adrift
 from halfwidth.vehicle.align import EDGE
 from halfwidth.vehicle.grid import sampled
-from halfwidth.vehicle.lapses import lapses, put_right, words
+from halfwidth.vehicle.lapse import put_right, words
+from halfwidth.vehicle.lapses import lapses
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.sensors import STREAM, Calibration, Offset
 from halfwidth.vehicle.stamps import Stamps
@@ -89,6 +90,11 @@ class Item:
         }
 
 
+def has(log: Log, name: str) -> bool:
+    """Return whether a field of a log has a value anywhere."""
+    return bool(np.isfinite(getattr(log, name)).any())
+
+
 def fill_line(log: Log) -> str:
     """Return the command that fills a log."""
     source = log.source or "LOG"
@@ -147,7 +153,7 @@ def items(log: Log, known: Calibration, stamps: Stamps | None = None) -> list[It
 def _clock(log: Log, known: Calibration, stream: str) -> Item:
     words = stream.replace("_", " ")
     name = f"clock of {words}"
-    if not np.isfinite(getattr(log, STREAM[stream])).any():
+    if not has(log, STREAM[stream]):
         return Item(name, "not checked", f"there is no {words}")
     one = known.offsets.get(stream, Offset())
     shown = {"sd": _number(one.sd), "change": one.change or None, "at": [list(pair) for pair in one.at]}

@@ -90,6 +90,12 @@ class Windows:
     course: Floats
 
 
+def baseline(log: Log, least: float) -> float:
+    """Return how long windows have to be, s: `least`, or the usual step between fixes where these come less often."""
+    t = log.t[log.fixed]
+    return max(least, float(np.median(np.diff(t)))) if t.size > 1 else least
+
+
 def windows(log: Log, baseline: float, *, swapped: bool = False) -> Windows:
     """Pair every fix with the first one at least `baseline` seconds later, at most twice as late."""
     seen = log.fixed

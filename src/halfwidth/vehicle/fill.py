@@ -36,8 +36,9 @@ from halfwidth.vehicle.distrust import distrusted
 from halfwidth.vehicle.estimators import METHODS, Method, heading_of, with_limits
 from halfwidth.vehicle.estimators import method as method_of
 from halfwidth.vehicle.grid import Grid, sampled
-from halfwidth.vehicle.lapses import lapses, put_right
-from halfwidth.vehicle.lapses import words as lapse_words
+from halfwidth.vehicle.lapse import put_right
+from halfwidth.vehicle.lapse import words as lapse_words
+from halfwidth.vehicle.lapses import lapses
 from halfwidth.vehicle.log import Log
 from halfwidth.vehicle.path import Path
 from halfwidth.vehicle.pieces import CONTEXT, Piece, pieces_of, spans_of, wanted_rows, with_pauses_filled

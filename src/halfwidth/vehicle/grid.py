@@ -325,11 +325,33 @@ def silent_from(step: Floats) -> float:
     return max(3.0 * float(np.median(step)), 0.5)
 
 
-def silence(t: Floats, clock: Floats, rate: float, most: float, limit: float | None = None) -> Floats:
-    """Return the standard deviation of each step's mean where the sensor was silent for long, 0 elsewhere.
+def between(middle: Floats, h: Floats, clock: Floats, rate: float, most: float) -> tuple[Floats, Floats]:
+    """Return the standard deviation of each step's mean by how far samples are, and the time between these, s.
 
     The steps of one silence err together, while an estimator takes them as independent. So each is given the share of
     variance that makes the whole silence come out right: sd^2 * (length of the silence) / (length of the step).
+
+    Parameters
+    ----------
+    middle, h : (T,) arrays
+        Middle and length of each step, s.
+    clock : (n,) array
+        Times of the samples, s.
+    rate, most : float
+        How fast the quantity changes, a second, and by how much at most.
+    """
+    k = np.searchsorted(clock, middle)
+    before, after = clock[np.maximum(k - 1, 0)], clock[np.minimum(k, clock.size - 1)]
+    outside = (k == 0) | (k == clock.size)
+    far = np.where(
+        outside, np.abs(middle - np.where(k == 0, after, before)), np.minimum(middle - before, after - middle)
+    )
+    length = np.where(outside, 2 * far, after - before)
+    return np.minimum(rate * far, most) * np.sqrt(np.maximum(length / h, 1.0)), length
+
+
+def silence(t: Floats, clock: Floats, rate: float, most: float, limit: float | None = None) -> Floats:
+    """Return the standard deviation of each step's mean where the sensor was silent for long (`between`), else 0.
 
     Parameters
     ----------
@@ -351,15 +373,8 @@ def silence(t: Floats, clock: Floats, rate: float, most: float, limit: float | N
     limit = silent_from(np.diff(clock)) if limit is None else limit
     middle = t.copy()
     middle[1:] -= np.diff(t) / 2
-    k = np.searchsorted(clock, middle)
-    before, after = clock[np.maximum(k - 1, 0)], clock[np.minimum(k, clock.size - 1)]
-    outside = (k == 0) | (k == clock.size)
-    far = np.where(
-        outside, np.abs(middle - np.where(k == 0, after, before)), np.minimum(middle - before, after - middle)
-    )
-    length = np.where(outside, 2 * far, after - before)
     h = np.concatenate((np.diff(t)[:1], np.diff(t)))
-    sd = np.minimum(rate * far, most) * np.sqrt(np.maximum(length / h, 1.0))
+    sd, length = between(middle, h, clock, rate, most)
     return np.where(length > limit, sd, 0.0)
 
 

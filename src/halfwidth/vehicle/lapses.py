@@ -11,18 +11,17 @@ tunnel, or fade, contradict the speed for some seconds, too, but by no constant 
 What is in another unit or sign is put right, what is silent or wrong by a factor that is no unit's is not used.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from halfwidth.vehicle import evidence
+from halfwidth.vehicle.lapse import Lapse, put_right
+from halfwidth.vehicle.leaping import leaping_speed
 from halfwidth.vehicle.log import Log
-from halfwidth.vehicle.rows import counted
-from halfwidth.vehicle.spikes import BLIND, LIMIT
-from halfwidth.vehicle.units import FACTOR_NEAR, contradicted_yaw, matched_factor
+from halfwidth.vehicle.spikes import LIMIT
+from halfwidth.vehicle.units import FACTOR_NEAR
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,11 +31,6 @@ _FACTORS = {
     "speed_mps": (1.0, 3.6, 1 / 0.44704, 3600 / 1852, 1 / 3.6, 0.44704, 0.0, np.nan),
     "yaw_rate_radps": (1.0, -1.0, 180 / np.pi, -180 / np.pi, np.pi / 180, -np.pi / 180, 0.0),
 }
-
-_NAMES = {"speed_mps": "speed", "yaw_rate_radps": "yaw rate"}
-
-#: What units are called by their factor.
-_UNITS = {3.6: "km/h", 1 / 0.44704: "mph", 3600 / 1852: "knots", 180 / np.pi: "deg/s"}
 
 #: Length of a window, s, by stream; windows that are needed, and that a stretch must have in which it is contradicted.
 _SPAN = {"speed_mps": 1.0, "yaw_rate_radps": 2.0}
@@ -63,78 +57,14 @@ _OFTEN, _CHANGES = 3.0, 50
 #: them is none of this car.
 _TURN, _TURN_SIZES, _AGAINST = 0.25, 2.5, 0.6
 
-#: A speed that leaps away comes back within so many seconds; nobody drives backwards this fast, m/s.
-_AWAY, _FORWARD = 30.0, 6.0
+#: Nobody drives backwards this fast, m/s.
+_FORWARD = 6.0
 
 #: Two states fit a window alike if they cost so little more.
 _ALIKE = 0.5
 
-#: Lapses of a stream that are said one by one.
-_SAID = 5
-
-#: A way between two fixes is reckoned in so many steps a second, and so many at most.
-_RECKONED, _NODES = 10.0, 10_000
-
 #: Windows at most, so that a long drive takes no longer.
 _WINDOWS = 20_000
-
-
-@dataclass(frozen=True)
-class Lapse:
-    """A stretch of a stream that is not as the rest.
-
-    Parameters
-    ----------
-    name : str
-        Field of the log.
-    first, last : int
-        Its first and last row.
-    reads : float
-        What it reads of the truth in the stretch; 0 if it is silent, NaN if it has nothing to do with it.
-    rest : float
-        What it reads elsewhere.
-    says : float
-        What it says there at first.
-    pace : float
-        Median of what the fixes show there: speed, m/s, or yaw rate, rad/s.
-    right : bool
-        Whether it is put right; otherwise it is not used.
-    """
-
-    name: str
-    first: int
-    last: int
-    reads: float
-    rest: float
-    says: float
-    pace: float
-    right: bool
-
-    @property
-    def factor(self) -> float:
-        """What makes the stretch like the rest."""
-        return self.rest / self.reads if self.right else float("nan")
-
-    def words(self, log: Log) -> str:
-        """Say what it is, with times."""
-        label, t = _NAMES[self.name], log.t
-        when = f"from {t[self.first]:.1f} s on" if self.last == len(log) - 1 else f"{t[self.last]:.1f} s"
-        if self.last < len(log) - 1:
-            when = f"from {t[self.first]:.1f} to {when}" if self.last > self.first else f"at {when}"
-        if np.isnan(self.reads):
-            return f"the {label} does not follow the turns that the fixes show: not used"
-        if not self.reads:
-            moves = f"the car goes {self.pace:.0f} m/s" if self.name == "speed_mps" else "the fixes turn"
-            return f"the {label} says {self.says:.3g} {when} while {moves}: not used"
-        ratio = self.reads / self.rest
-        if self.name == "speed_mps" and ratio < 0:
-            return "the speed is negative all along, and no car drives backwards like that: taken as positive"
-        what = "what the fixes say" if self.rest == 1 else "what it reads elsewhere, as the fixes show,"
-        units = [f"in {name}" for size, name in _UNITS.items() if abs(np.log(abs(ratio) / size)) < 1e-6]
-        units += [f"{name} elsewhere" for size, name in _UNITS.items() if abs(np.log(abs(ratio) * size)) < 1e-6]
-        units += ["turned round"] if ratio < 0 else []
-        why = f" ({', '.join(units)})" if units and self.right else ""
-        return f"the {label} reads {ratio:.3g} times {what} {when}{why}: " + ("put right" if self.right else "not used")
 
 
 def lapses(log: Log) -> tuple[Lapse, ...]:
@@ -152,25 +82,11 @@ def lapses(log: Log) -> tuple[Lapse, ...]:
     believed = _without_repeats(log)
     turned = _backwards(believed)
     believed = put_right(believed, turned)
-    leaping = _leaping(believed)
-    believed = put_right(believed, leaping)
+    leapt = leaping_speed(believed)
+    believed = put_right(believed, leapt)
     found = {name: _of(believed, name) for name in _FACTORS}
-    speed = sorted([*leaping, *found["speed_mps"]], key=lambda lapse: lapse.first)
+    speed = sorted([*leapt, *found["speed_mps"]], key=lambda lapse: lapse.first)
     return (*turned, *speed, *found["yaw_rate_radps"])
-
-
-def words(log: Log, found: Sequence[Lapse]) -> list[str]:
-    """Say what lapses are: the first ones of each stream, and of the others how many they are."""
-    said: list[str] = []
-    for name in _FACTORS:
-        for right, done in ((True, "put right"), (False, "not used")):
-            own = [lapse for lapse in found if lapse.name == name and lapse.right == right]
-            said += [lapse.words(log) for lapse in own[:_SAID]]
-            if own[_SAID:]:
-                when = f"from {log.t[own[_SAID].first]:.1f} to {log.t[own[-1].last]:.1f} s"
-                more = counted(len(own) - _SAID, "more stretch")
-                said.append(f"the {_NAMES[name]} contradicts the fixes in {more} {when}: {done}")
-    return said
 
 
 def _backwards(log: Log) -> list[Lapse]:
@@ -182,22 +98,11 @@ def _backwards(log: Log) -> list[Lapse]:
     fast = np.abs(values) > 0.5 * float(np.quantile(np.abs(values), 0.99))
     if not way.sum() < -0.5 * np.abs(way).sum() or not float(np.mean(values[fast] < 0)) > 0.9:
         return []
-    if log.fixed.sum() < 2:
-        return []
-    seen = evidence.windows(log, max(1.0, float(np.median(np.diff(log.t[log.fixed])))))
+    seen = evidence.windows(log, evidence.baseline(log, 1.0))
     pace = float(np.quantile(seen.distance / (seen.stop - seen.start), 0.9)) if seen.start.size else 0.0
     if pace < _FORWARD:
         return []
     return [Lapse("speed_mps", 0, len(log) - 1, -1.0, 1.0, float(values[0]), pace, True)]
-
-
-def put_right(log: Log, found: Sequence[Lapse]) -> Log:
-    """Return a log with its lapses put right or left out."""
-    changed: dict[str, Any] = {}
-    for lapse in found:
-        values = changed.setdefault(lapse.name, getattr(log, lapse.name).copy())
-        values[lapse.first : lapse.last + 1] *= lapse.factor
-    return replace(log, **changed) if changed else log
 
 
 def _without_repeats(log: Log) -> Log:
@@ -209,123 +114,6 @@ def _without_repeats(log: Log) -> Log:
     gone = np.zeros(len(log), dtype=bool)
     gone[rows[same]] = True
     return replace(log, lat_deg=np.where(gone, np.nan, log.lat_deg), lon_deg=np.where(gone, np.nan, log.lon_deg))
-
-
-def _leaping(log: Log) -> list[Lapse]:
-    """Return where the speed leaps away out of a car's reach and comes back, or says 0 and leaps, against the fixes.
-
-    Of a 0 that leaps at one end only and that fixes confirm elsewhere, what lies between that end and them is not used.
-    """
-    name = "speed_mps"
-    t, values = log.stream(name)
-    if t.size < _FEWEST:
-        return []
-    row = matched_factor(evidence.speed_ratio(log))
-    values = values * (row[2] if row is not None and row[3] == 1 else 1.0)
-    change = np.diff(values)
-    at = np.flatnonzero(np.abs(change) > LIMIT[name][0] + LIMIT[name][1] * np.diff(t) + BLIND[name]) + 1
-    new = np.flatnonzero(change != 0) + 1
-    fixes = log.t[log.fixed]
-    unseen = max(1.0, 2.0 * float(np.median(np.diff(fixes)))) if fixes.size > 1 else 1.0
-    rows = np.flatnonzero(np.isfinite(getattr(log, name)))
-    judge = _Judge.of(log, t, values) if at.size else None
-    found: list[Lapse] = []
-    done = -1
-    for i, a in enumerate(at.tolist()):
-        if a <= done:
-            continue
-        before = values[a - 1]
-        ends = at[i + 1 : int(np.searchsorted(t[at], t[a] + _AWAY, side="right"))]
-        back = (change[a - 1] * change[ends - 1] < 0) & (np.abs(values[ends] - before) < abs(change[a - 1]) / 2)
-        k = int(np.searchsorted(new, a))  # `new[k]` is `a`
-        if back.any():
-            stop = int(ends[np.argmax(back)])
-            parts, pace = [(a, stop)], float(min(abs(before), abs(values[stop])))
-        elif values[a] == 0:
-            stop = int(new[k + 1]) if k + 1 < new.size else t.size
-            parts, pace = [(a, stop), (a, min(stop, _before(t, fixes, a)))], abs(float(before))
-        elif before == 0:
-            first = int(new[k - 1]) if k else 0
-            parts, pace = [(first, a), (max(first, _after(t, fixes, a)), a)], abs(float(values[a]))
-        else:
-            continue
-        if judge is not None and judge.confirms(*parts[0], pace):
-            # what no fix sees may be wrong nevertheless
-            parts = [(b, c) for b, c in parts[1:] if c > b and t[c - 1] - t[b] > unseen]
-        if not parts:
-            continue
-        first, stop = parts[0]
-        says = float(np.median(values[first:stop]))
-        found.append(Lapse(name, int(rows[first]), int(rows[stop - 1]), 0.0, 1.0, says, pace, False))
-        done = stop
-    return found
-
-
-def _before(t: Floats, fixes: Floats, a: int) -> int:
-    """Return the first sample that is not before the first fix from sample a on."""
-    k = int(np.searchsorted(fixes, t[a]))
-    return int(np.searchsorted(t, fixes[k])) if k < fixes.size else t.size
-
-
-def _after(t: Floats, fixes: Floats, a: int) -> int:
-    """Return the first sample after the last fix before sample a."""
-    k = int(np.searchsorted(fixes, t[a])) - 1
-    return int(np.searchsorted(t, fixes[k], side="right")) if k >= 0 else 0
-
-
-@dataclass(frozen=True, eq=False)
-class _Judge:
-    """What says whether a speed that leaps is right: samples, fixes, m, and the yaw rate in rad/s, put right."""
-
-    t: Floats
-    values: Floats
-    fixes: Floats
-    east: Floats
-    north: Floats
-    clock: Floats
-    rate: Floats
-
-    @classmethod
-    def of(cls, log: Log, t: Floats, values: Floats) -> "_Judge":
-        east, north = evidence.local_metres(log.lat_deg[log.fixed], log.lon_deg[log.fixed])
-        clock, rate = log.stream("yaw_rate_radps")
-        factor = contradicted_yaw(evidence.turning(log)) or 1.0
-        return cls(t, values, log.t[log.fixed], east, north, clock, rate * factor)
-
-    def confirms(self, first: int, stop: int, pace: float) -> bool:
-        """Return whether the fixes beside some samples move as these say, and not at a pace.
-
-        Where there are none, those around them are asked how far the way along the yaw rate leads.
-        """
-        a = int(np.searchsorted(self.fixes, self.t[first]))
-        b = int(np.searchsorted(self.fixes, self.t[stop - 1], side="right")) - 1
-        if b <= a:
-            return self._nearer(first, stop, pace)
-        shown = self._apart(a, b) / float(self.fixes[b] - self.fixes[a])
-        return abs(shown - float(np.abs(self.values[first:stop]).mean())) < abs(shown - pace)
-
-    def _nearer(self, first: int, stop: int, pace: float) -> bool:
-        """Return whether dead reckoning between the fixes around samples comes nearer with them than at a pace."""
-        begin, end = self.t[first], self.t[stop - 1]
-        a, b = int(np.searchsorted(self.fixes, begin)) - 1, int(np.searchsorted(self.fixes, end))
-        if a < 0 or b >= self.fixes.size:
-            return False
-        apart, length = self._apart(a, b), float(self.fixes[b] - self.fixes[a])
-        when = np.linspace(self.fixes[a], self.fixes[b], 2 + int(min(_RECKONED * length, _NODES)))
-        turning = np.interp(when, self.clock, self.rate) if self.clock.size else np.zeros(when.size)
-        step = np.diff(when)
-        azimuth = np.concatenate(([0.0], np.cumsum(step * 0.5 * (turning[1:] + turning[:-1]))))
-        speed = np.abs(np.interp(when, self.t, self.values))
-        at_pace = np.where((when >= begin) & (when <= end), pace, speed)
-        off = []
-        for v in (speed, at_pace):
-            way = v * np.exp(1j * azimuth)
-            off.append(abs(abs(complex(np.sum(step * 0.5 * (way[1:] + way[:-1])))) - apart))
-        return off[0] < off[1]
-
-    def _apart(self, a: int, b: int) -> float:
-        """Return how far two fixes are apart, m."""
-        return float(np.hypot(self.east[b] - self.east[a], self.north[b] - self.north[a]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -406,7 +194,7 @@ def _reach(t: Floats, values: Floats, name: str) -> Floats:
 
 def _windows(log: Log, name: str, t: Floats, values: Floats) -> _Windows | None:
     """Return windows in which fixes and a stream can be compared; None if they are too few."""
-    span = max(_SPAN[name], float(np.median(np.diff(log.t[log.fixed]))))
+    span = evidence.baseline(log, _SPAN[name])
     chord = evidence.windows(log, span)
     took = chord.stop - chord.start
     if took.size < _FEWEST:

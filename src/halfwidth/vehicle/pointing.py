@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from halfwidth.vehicle.grid import Grid
+from halfwidth.vehicle.grid import Grid, between
 
 Floats = NDArray[np.float64]
 
@@ -123,16 +123,8 @@ def with_speed(drive: Grid) -> Grid:
     when, took, moved = _secants(drive)
     if when.size == 0:
         return drive if drive.has_speed else replace(drive, speed_sd=np.full(len(drive), 5.0), has_speed=True)
-    h = drive.h
-    middle = drive.t - 0.5 * h
-    k = np.searchsorted(when, middle)
-    before, after = when[np.maximum(k - 1, 0)], when[np.minimum(k, when.size - 1)]
-    outside = (k == 0) | (k == when.size)
-    far = np.where(
-        outside, np.abs(middle - np.where(k == 0, after, before)), np.minimum(middle - before, after - middle)
-    )
-    pause = np.where(outside, 2 * far, after - before)
-    sd = np.minimum(0.7 * far, 5.0) * np.sqrt(np.maximum(pause / h, 1.0))
+    middle = drive.t - 0.5 * drive.h
+    sd, pause = between(middle, drive.h, when, 0.7, 5.0)
     lost = pause > 1.5 * float(np.median(took))
     speed = np.interp(middle, when, np.abs(moved) / took)
     if drive.has_speed:

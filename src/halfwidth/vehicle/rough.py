@@ -50,7 +50,7 @@ class Rough:
         lags = np.arange(-WIDEST, WIDEST + 1e-9, max(0.1, min(usual, 1.0) / 4))
         when, misfit = {}, {}
         plain = replace(known, offsets={})
-        span = max(least, usual)
+        span = evidence.baseline(log, least)
         spans = {"speed": span, "yaw_rate": _TURN}
         chord = evidence.windows(log, span)
         middle, took = 0.5 * (chord.start + chord.stop), chord.stop - chord.start
