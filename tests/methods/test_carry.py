@@ -111,6 +111,7 @@ def test_no_row_speaks_twice():
     for newest in range(40):  # windows of 10 rows, each telling 1 in all
         known = carried.known(newest - 9, 10)
         gone = max(newest - 9, 0)
+        assert (0.0 if known is None else known.rows) == pytest.approx(gone)
         for told in () if known is None else known:
             assert told.item() <= gone / 10 + 1e-9
         carried.waiting.append((newest, one.times(0.1), Known.none(1)))
