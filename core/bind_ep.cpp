@@ -389,7 +389,7 @@ nb::dict run(const nb::dict& problem, In s, In eps, int sweeps, double tol, doub
 class EpFrame {
   public:
     EpFrame(const nb::dict& problem, InBool free, In cap, In count, InBool squared, bool learn_eps, double rate, double start_eps,
-            double beta_a, double beta_b, In z, const nb::dict& limits, const std::optional<nb::dict>& outside)
+            double power, double beta_a, double beta_b, In z, const nb::dict& limits, const std::optional<nb::dict>& outside)
         : p_(problem, whole_registers(z.shape(0))), free_(free), cap_(cap), count_(count), squared_(squared), z_(z) {
         want(z.ndim() == 2 && z.shape(0) >= 1, "z (nodes, q)");
         if (outside) {
@@ -410,6 +410,7 @@ class EpFrame {
         l_.learn_eps = learn_eps;
         l_.rate = rate;
         l_.start_eps = start_eps;
+        l_.power = power;
         l_.beta_a = beta_a;
         l_.beta_b = beta_b;
         l_.z = z_.data();
@@ -437,13 +438,11 @@ class EpFrame {
         p_.a.damping = real("damping");
     }
 
-    // one window: `before` as an earlier one handed it on, `drop` rows before this one; `known` in the order of `told`; `power`
-    // of the prior.
+    // one window: `before` as an earlier one handed it on, `drop` rows before this one; `known` in the order of `told`.
     // Returns what was found, and what it hands on.
     nb::tuple learn(In floor, In scale, In start, In m0, In P0, In half0, In b, In y, nb::handle before, int drop, int shaped,
-                     std::optional<In> known, double power) const {
+                     std::optional<In> known) const {
         hw::EpLearnArgs l = l_;
-        l.power = power;
         hw::EpArgs a = p_.a, bounds{};
         Problem::of_window(a, m0, P0, half0, b, y);
         const std::size_t stages = a.T + 1, n = a.n, rows = a.rows, groups = a.groups, nodes = l.nodes, abreast = a.members;
@@ -619,11 +618,10 @@ void bind_ep(nb::module_& mod) {
         });
     nb::class_<EpFound>(mod, "EpFound", "What a window found, array by array as it is asked for.").def("__getitem__", &item);
     nb::class_<EpFrame>(mod, "EpFrame", "A chain without its data whose half-widths are to be found by evidence; see core/ep_learn.hpp.")
-        .def(nb::init<const nb::dict&, InBool, In, In, InBool, bool, double, double, double, double, In, const nb::dict&,
+        .def(nb::init<const nb::dict&, InBool, In, In, InBool, bool, double, double, double, double, double, In, const nb::dict&,
                       const std::optional<nb::dict>&>(),
-             "problem"_a, "free"_a, "cap"_a, "count"_a, "squared"_a, "learn_eps"_a, "rate"_a, "start_eps"_a, "beta_a"_a,
+             "problem"_a, "free"_a, "cap"_a, "count"_a, "squared"_a, "learn_eps"_a, "rate"_a, "start_eps"_a, "power"_a, "beta_a"_a,
              "beta_b"_a, "z"_a, "limits"_a, "outside"_a.none() = nb::none())
         .def("learn", &EpFrame::learn, "floor"_a, "scale"_a, "start"_a, "m0"_a, "P0"_a, "half0"_a, "b"_a, "y"_a,
-             "before"_a.none() = nb::none(), "drop"_a = 0, "shaped"_a = 0, "known"_a.none() = nb::none(),
-             "power"_a = 0.0);
+             "before"_a.none() = nb::none(), "drop"_a = 0, "shaped"_a = 0, "known"_a.none() = nb::none());
 }

@@ -39,9 +39,10 @@ def test_mode_without_a_prior_is_maximum_likelihood(seed):
     z = posterior.nodes(4, 1)
     limits = posterior._LIMITS | {"condition": 0.0, "close": 1e-10, "steps": 60, "reference": 0.0, "again": 0}
     learner = _core.EpFrame(
-        chain.frame.problem, chain.free, chain.cap, chain.count, chain.frame.fitted, False, 0.0, -14.0, 1.0, 1.0, z, limits,
+        chain.frame.problem, chain.free, chain.cap, chain.count, chain.frame.fitted, False, 0.0, -14.0, posterior.WARP, 1.0,
+        1.0, z, limits,
     )  # fmt: skip
-    found, _ = learner.learn(chain.floor, chain.scale, chain.guess, **chain.data, power=posterior.WARP)
+    found, _ = learner.learn(chain.floor, chain.scale, chain.guess, **chain.data)
 
     def cost(phi):
         v = np.exp(2 * phi)

@@ -19,8 +19,8 @@ As a factor of the evidence bounds count as an event that small half-widths make
 up. So they are a condition in all rows but 26, those of the newest window and those that have left alike
 (`condition`): a quadratic of log P(inside | s), the evidence of the chain with its bounds alone, is taken off. It is
 found anew in every N-th window. Its slope has what expectation propagation leaves out to second order: the windows'
-evidence has it, and the difference would add up over many windows. What is left out beyond is about the same in both:
-with the bounds' slope by particles in its place the slope at the truth has more bias, not less
+evidence has it, and the difference would add up over many windows. What is left out beyond that is about the same in
+both: with the bounds' slope by particles in its place the slope at the truth has more bias, not less
 (`benchmarks/posterior.py slopes`).
 
 The state before the first row of a window is what the sites of the rows that have left make of it: the forwards message
@@ -66,8 +66,6 @@ class Known:
     Parameters
     ----------
     pull, precision, power : (p,), (p, p), (p,) arrays
-    rows : float
-        Rows that it is known from.
 
     Attributes
     ----------
@@ -75,19 +73,17 @@ class Known:
         All of it, one after the other.
     """
 
-    __slots__ = ("rows", "values")
-    rows: float
+    __slots__ = ("values",)
     values: Array
 
-    def __init__(self, pull: Array, precision: Array, power: Array, rows: float = 0.0) -> None:
-        self.rows = rows
+    def __init__(self, pull: Array, precision: Array, power: Array) -> None:
         self.values = np.concatenate((pull, np.ravel(precision), power), dtype=float)
 
     @classmethod
-    def of(cls, values: Array, rows: float = 0.0) -> "Known":
+    def of(cls, values: Array) -> "Known":
         """Wrap what the core found."""
         known = object.__new__(cls)
-        known.rows, known.values = rows, values
+        known.values = values
         return known
 
     @classmethod
@@ -202,8 +198,7 @@ class Carried:
             self.rows += 1.0
         self.given = None
         if self.rows:
-            alone = kept_in + self.inside.values
-            self.given = Known.of(gone - condition(rows + self.rows) * alone, self.rows)
+            self.given = Known.of(gone - condition(rows + self.rows) * (kept_in + self.inside.values))
         return self.given
 
     def leave(self, a: int) -> None:

@@ -10,9 +10,8 @@ smoother passes. Its evidence log Z finds what is unknown:
 Staying inside `bounds` is an event that small half-widths make likely: over many rows it would shrink them. So beyond
 26 rows bounds are a condition: Z is divided by the evidence that the bounds alone have (core/ep_learn.hpp).
 The prior has no scale: where a noise drowns in the others told ~ s^2 and the prior falls to 0, where it is seen told
-is 1 and the prior is a power. `told` alone is Jeffreys', which leaves intervals of many rows covered as they say; few
-rows want a power beside it. Of 26 rows it is `POWER`, as a study of coverage gave (benchmarks/posterior.py), of more
-it falls with their number, rows that have left a stream among them.
+is 1 and the prior is a power. `power` is what a study of coverage gave in windows of 6, 26 and 51
+rows (benchmarks/posterior.py).
 Weighted nodes carry what is not known of s into the intervals: stages of normal points, the first about the mode,
 each later one with the moments of all before it, weighted by evidence over the mixture of the stages
 (core/ep_learn.hpp). The evidence of a node has what expectation propagation leaves out of it to second order, without
@@ -48,7 +47,7 @@ from halfwidth.noise import Gaussian
 from halfwidth.record import Record
 from halfwidth.result import Estimate
 
-#: Power of the half-widths' prior within 26 rows; see above.
+#: Power of the half-widths' prior; see above.
 POWER = 0.4
 #: Nodes of a stage, and most stages (core/ep_learn.hpp).
 _STAGE, _STAGES = 16, 8
@@ -90,7 +89,7 @@ class Posterior:
     method : {"ep", "sample"}
         Expectation propagation, or draws by Markov chains: slow, and the truth that the first is held against. Draws
         take linear models of uniform or Gaussian noise; ``info["rhat"]`` says whether the chains agree. Their prior of
-        a half-width is the power of 26 rows alone, without `told`.
+        a half-width is the power alone, without `told`.
     nodes : int
         Most points over which unknown half-widths are integrated: no more are taken than what is left in doubt asks
         for, and no fewer than six and two for each unknown. With five half-widths of 26 rows 32 leave the means .05
@@ -293,7 +292,6 @@ class Posterior:
             chain.floor, chain.scale, chain.guess if start is None else start.s,
             chain.m0, chain.P0, chain.half0, chain.b, chain.y,
             None if start is None else start.before, drop, shaped, None if known is None else known.values,
-            prior_power(len(chain.b) + (0.0 if known is None else known.rows)),
         )  # fmt: skip
         found, handed = self._learner(chain, model, known is None).learn(*data)
         code = found["code"]
@@ -333,7 +331,7 @@ class Posterior:
             limits["most"] = 1
         return _core.EpFrame(
             frame.problem, frame.free, frame.cap, frame.count, frame.fitted, learn_rate, rate,
-            math.log(rate / (1 - rate)) if rate > 0 else -14.0, *beta, nodes(q, count), limits,
+            math.log(rate / (1 - rate)) if rate > 0 else -14.0, POWER, *beta, nodes(q, count), limits,
             frame.outside if limits["condition"] > 0 else None,
         )  # fmt: skip
 
@@ -349,11 +347,6 @@ class Posterior:
         if self.outliers is True:
             return 0.01, True, _RATE
         return float(self.outliers), False, (1.0, 1.0)
-
-
-def prior_power(rows: float) -> float:
-    """Return the power of the half-widths' prior that goes with so many rows."""
-    return POWER * (1.0 - condition(rows))
 
 
 @functools.lru_cache(maxsize=64)
