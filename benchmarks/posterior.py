@@ -1,7 +1,7 @@
 """Accuracy and coverage of `Posterior` on the system of Pavelková and Kárný (2013), sec. 6.
 
     python benchmarks/posterior.py [table] [windows] [streams] [known] [nodes] [variances] [priors] [ensemble] [outliers]
-                                   [robust] [calibration] [pictures]
+                                   [robust] [calibration] [pictures] [slopes]
 
 Paths stay inside the boxes by rejection of whole paths. The Kalman filter is told the true covariances and is clipped to
 the boxes. `windows`: each window of `Delta` + 1 rows on its own, told no half-width and nothing of the past, of which the
@@ -9,7 +9,8 @@ Kalman filter sees 15 rows. `streams`: long paths by `Window(Posterior())`, whic
 Kalman filter on the same rows, after a burn-in of 200 rows; whole paths of that length cannot be rejected, so one is the
 genealogy of a particle among 5,000 that are resampled from those inside at every row. `table` is both; without arguments
 it is printed. `nodes`: what fewer nodes leave of the integral over half-widths. `outliers` redraws disturbances that would leave the boxes, which is another law. `calibration` draws
-half-widths from the prior that is used, without bounds. `WINDOWS=500` sets the number of windows; streams have twelve times
+half-widths from the prior that is used, without bounds. `slopes`: whether the evidence that streams learn half-widths from is
+unbiased. `WINDOWS=500` sets the number of windows; streams have twelve times
 as many. `PICTURES=folder` writes the diagrams of `calibration` and `pictures` there.
 """
 
@@ -21,12 +22,14 @@ import time
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+import halfwidth._core as _core  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy.special import ndtr  # noqa: E402
 
 import halfwidth as hw  # noqa: E402
 from halfwidth.methods import posterior  # noqa: E402
 from halfwidth.methods._carry import Known  # noqa: E402
+from halfwidth.methods._sites import sites  # noqa: E402
 from halfwidth.methods._sliding import Sliding, stacked  # noqa: E402
 from halfwidth.reproduce.paper003 import BOX, KAPPA, A, B, C, E, F, Q, R  # noqa: E402
 from halfwidth.spread import part as rows_of  # noqa: E402
@@ -599,6 +602,90 @@ def pictures():
     _save(axes, "band")
 
 
+STEP = 0.1
+
+
+def slopes(*, delta=25, rows=360, every=6, seed=6):
+    """Print the mean slope of the log evidence in log s at the true half-widths, as windows of a stream tell it.
+
+    It is 0 on average where half-widths are learned without bias. The evidence of the bounds alone, which it is divided
+    by, is also had from particles.
+    """
+    true = np.r_[np.full(3, Q), np.full(2, R)]
+    moved = np.repeat(np.eye(5), 2, axis=0) * np.tile([STEP, -STEP], 5)[:, None]
+    members = np.concatenate([true[None], true * np.exp(moved)])
+
+    def slope(chain):  # of expectation propagation, to first order and what the second adds
+        found = _core.ep_run(chain, members, np.zeros(len(members)), 60, 1e-5, 1.0, None)
+        return [(v[1::2] - v[2::2]) / (2 * STEP) for v in (found["log_z"], found["second"])]
+
+    unknown = hw.Uniform.unknown(at_most=1.0)
+    for correlated in (False, True):
+        found, particles = [], []
+        for path in range(max(2, WINDOWS // 5)):
+            rng = np.random.default_rng([seed, path])
+            X, u = stays(rng, rows + delta, correlated=correlated, many=1_500)
+            y = X[1:] @ C.T + rng.uniform(-R, R, (len(u), 2))
+            y = y @ np.linalg.inv(F).T if correlated else y
+            told = Sliding(
+                hw.Window(hw.Posterior(), delta), system(hw.Uniform(Q), hw.Uniform(R), correlated=correlated), 0.0
+            )
+            own, off = [], []
+            for t in range(rows):
+                told.push(y[t], u[t], 1.0)
+                if t < 60 or t % every:
+                    continue
+                part = slice(t - delta, t + 1)
+                record = hw.Record(np.arange(1.0, delta + 2), y[part], u[part])
+                chain = sites(system(unknown, unknown, told.carried.first, correlated=correlated), record)
+                own.append([*slope(chain.problem), *slope(chain.outside)])
+                if len(own) % 12 == 0:
+                    exact = _by_particles(told.carried.first, u[part], correlated, int(rng.integers(2**31)))
+                    off.append(exact - np.sum(own[-1][2:], axis=0)[:3])
+            found.append(np.mean(own, axis=0))
+            particles.append(np.mean(off, axis=0))
+        found, particles = (100 / (delta + 1) * np.array(v) for v in (found, particles))
+        sound = (np.abs(found) < 1e4).all(axis=(1, 2))  # so sharp a box that its cumulants overflow
+        with_data, bounds = found[sound, :2].sum(axis=1), found[sound, 2:].sum(axis=1)
+        print(
+            f"\n{sound.sum()} paths of {rows} rows"
+            + (", E and F" if correlated else "")
+            + "; slopes in log s of 100 rows, +- one"
+        )
+        for name, value in (
+            ("bounds alone", bounds[:, :3]),
+            ("  what particles differ by", particles),
+            ("data and bounds", with_data),
+            ("the difference, 0 wanted", with_data - bounds),
+            ("  bounds by particles", (with_data - bounds)[:, :3] - particles[sound]),
+        ):
+            error = value.std(axis=0) / np.sqrt(len(value))
+            print(
+                f"{name:<28}"
+                + "  ".join(f"{m:6.2f} +-{e:4.2f}" for m, e in zip(value.mean(axis=0), error, strict=True)),
+                flush=True,
+            )
+
+
+def _by_particles(first, u, correlated, seed, many=3_000):
+    """Return the slope (3,) of log P(inside) in log q at the truth, of states that begin in a Gaussian."""
+    G = np.linalg.inv(E) if correlated else np.eye(3)
+    slope = np.empty(3)
+    for j in range(3):
+        total = 0.0
+        for sign in (1.0, -1.0):
+            rng, q = np.random.default_rng(seed), Q * np.exp(sign * STEP * np.eye(3)[j])
+            x = rng.multivariate_normal(first.mean, first.P, 8 * many)
+            x = x[((x >= BOX.lo) & (x <= BOX.hi)).all(axis=1)][:many]
+            for row in u:
+                x = (x @ A.T + row @ B.T + q * rng.uniform(-1, 1, x.shape)) @ G.T
+                alive = ((x >= BOX.lo) & (x <= BOX.hi)).all(axis=1)
+                total += sign * np.log(alive.mean())
+                x = x[alive][rng.integers(alive.sum(), size=many)]
+        slope[j] = total / (2 * STEP)
+    return slope
+
+
 def _figure(name, rows, columns):
     """Return axes (rows, columns) of a figure if `PICTURES` names a folder to put it in, else None."""
     if "PICTURES" not in os.environ:
@@ -623,7 +710,7 @@ def main():
     """Run what is asked for."""
     studies = {
         "table": table, "windows": windows_alone, "streams": streams, "known": against_draws, "nodes": fewer_nodes, "priors": priors, "ensemble": ensemble, "outliers": outliers, "robust": robust,
-        "calibration": calibration, "pictures": pictures, "variances": variances,
+        "calibration": calibration, "pictures": pictures, "slopes": slopes, "variances": variances,
     }  # fmt: skip
     for name in sys.argv[1:] or ["table"]:
         studies[name]()

@@ -431,14 +431,41 @@ def test_the_evidence_of_bounds_alone_has_its_second_order():
     assert slope == pytest.approx(exact, rel=0.02)
 
 
-def test_many_rows_between_bounds_have_the_evidence_that_they_have():
-    rng, x, path, one = np.random.default_rng(0), 0.0, [], hw.Box(-1, 1)
-    while len(path) < 60:
-        new = 0.5 * x + rng.uniform(-0.8, 0.8)
+def between(q, T, rng):
+    """Return a path of x' = x / 2 + w, |w| <= q, that stays between -1 and 1, seen with an error up to 1/2."""
+    x, path = 0.0, []
+    while len(path) < T:
+        new = 0.5 * x + rng.uniform(-q, q)
         if abs(new) < 1:
             x = new
             path.append(x)
-    y = np.array(path) + rng.uniform(-0.5, 0.5, 60)
+    return np.array(path) + rng.uniform(-0.5, 0.5, T)
+
+
+def test_what_streams_learn_from_has_the_slope_that_it_has():
+    q, T, h, one = 0.5, 60, 0.05, hw.Box(-1, 1)
+    model = hw.Linear([[0.5]], None, [[1]], hw.Uniform.unknown(at_most=5.0), hw.Uniform(0.5), one, bounds=one)
+    ends = q * np.exp([h, -h])
+    members = np.stack([ends, np.full(2, 0.5)], axis=1)
+
+    def slopes(problem):  # of the first order, and with the second
+        found = _core.ep_run(problem, members, np.zeros(2), 200, 1e-8, 1.0, None)
+        first, more = (np.subtract(*found[name]) / (2 * h) for name in ("log_z", "second"))
+        return np.array([first, first + more])
+
+    rng, off = np.random.default_rng(0), []
+    for _ in range(8):
+        y = between(q, T, rng)
+        chain = sites(model, hw.Record(np.arange(1.0, T + 1), y[:, None]))
+        exact = np.subtract(*(evidence_on_a_grid(s, T, y) - evidence_on_a_grid(s, T) for s in ends)) / (2 * h)
+        off.append(slopes(chain.problem) - slopes(chain.outside) - exact)
+    first, second = np.abs(np.mean(off, axis=0))
+    assert second < 0.3
+    assert first > 2 * second  # and it takes the second order
+
+
+def test_many_rows_between_bounds_have_the_evidence_that_they_have():
+    one, y = hw.Box(-1, 1), between(0.8, 60, np.random.default_rng(0))
     model = hw.Linear([[0.5]], None, [[1]], hw.Uniform(0.8), hw.Uniform(0.5), one, bounds=one)
     est = hw.estimate(model, hw.Record(np.arange(1.0, 61.0), y[:, None]), hw.Posterior())
     # bounds count as a factor in 26 rows, and as a condition in the others
