@@ -8,10 +8,10 @@ the boxes. `windows`: each window of `Delta` + 1 rows on its own, told no half-w
 Kalman filter sees 15 rows. `streams`: long paths by `Window(Posterior())`, which carries what it has learned, against the
 Kalman filter on the same rows, after a burn-in of 200 rows; whole paths of that length cannot be rejected, so one is the
 genealogy of a particle among 5,000 that are resampled from those inside at every row. `table` is both; without arguments
-it is printed. `nodes`: what fewer nodes leave of the integral over half-widths. `outliers` redraws disturbances that would leave the boxes, which is another law. `calibration` draws
-half-widths from the prior that is used, without bounds. `slopes`: whether the evidence that streams learn half-widths from is
-unbiased. `WINDOWS=500` sets the number of windows; streams have twelve times
-as many. `PICTURES=folder` writes the diagrams of `calibration` and `pictures` there.
+it is printed. `nodes`: what fewer nodes leave of the integral over half-widths. `outliers` redraws disturbances that would
+leave the boxes, which is another law. `calibration` draws half-widths from the prior that is used, without bounds.
+`slopes`: whether the evidence that streams learn half-widths from is unbiased. `WINDOWS=500` sets the number of windows;
+streams have twelve times as many. `PICTURES=folder` writes the diagrams of `calibration` and `pictures` there.
 """
 
 import dataclasses

@@ -17,9 +17,9 @@
 //
 //     E (g'w)^2 = (g'w of the means)^2 + u' (P_s+ + A P A') u + (g - u)' Q (g - u),     u = g - G' A' g
 //
-// (u is H'g with H = I - A G, and A G = I - H): the square of its mean, and its variance. A has about three entries a row and is never written down; what is
-// symmetric is found once. Four drives go side by side, one in each lane, whatever their lengths: a drive that has ended
-// repeats its last row and says nothing more.
+// (u is H'g with H = I - A G, and A G = I - H): the square of its mean, and its variance. A has about three entries a row
+// and is never written down; what is symmetric is found once. Four drives go side by side, one in each lane, whatever
+// their lengths: a drive that has ended repeats its last row and says nothing more.
 #pragma once
 
 #include "drive_entry.hpp"

@@ -69,6 +69,19 @@ def test_a_step_that_lowers_the_likelihood_is_cut_in_half(monkeypatch):
     assert fit.loglik > best - 1.0
 
 
+def test_learning_that_loses_its_way_leaves_the_best_it_had(monkeypatch):
+    drive = sampled(noisy(duration=100.0).log).without(40.0, 60.0)
+    best = chain.solve([drive], chain.Chain(**GAUSSIAN))[0].loglik
+    right, calls = chain._learnt, []
+
+    def lost(*given):
+        calls.append(given)
+        return right(*given) * (1.0 if len(calls) < 18 else 1e4)
+
+    monkeypatch.setattr(chain, "_learnt", lost)
+    assert chain.solve([drive], chain.Chain(**GAUSSIAN))[0].loglik > best - 1.0
+
+
 def test_learning_raises_the_likelihood():
     drive = sampled(noisy(duration=100.0).log).without(40.0, 60.0)
     loglik = [chain.solve([drive], chain.Chain(rounds=n, **GAUSSIAN))[0].loglik for n in (1, 3, 8, 24)]

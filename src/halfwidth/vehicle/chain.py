@@ -30,8 +30,8 @@ largest likelihood. At its maximum a scale is the mean of squared residuals of t
 much of it the fixes tell (Harville 1977, MacKay 1992; `_learnt`): twice the logarithmic step of a rule that never
 lowers the likelihood (Zhou, Hu, Zhou and Lange 2019), and where the likelihood falls a drive takes half of it from then
 on. It comes near the maximum in some 20 rounds; expectation maximisation is as near after hundreds, since a scale that
-is too large explains any path. Each round re-linearises about its own path first. Many drives (outages of one log) are
-solved side by side.
+is too large explains any path. Each round re-linearises about its own path first; the last one goes back to the best of
+the late ones where the likelihood has fallen since. Many drives (outages of one log) are solved side by side.
 
 Where a yaw rate is silent for a while its residual has no noise of its own: the yaw rate is what the log's own are
 like, and how it deviates from what is expected between the samples on both sides is one more state (`turning`). A gap
@@ -252,14 +252,27 @@ def _solved(
     s2 = np.where(learns, sigma, _FLOOR) ** 2
     # of each drive: the scales before its last step, the likelihood there, and what share of a step is taken
     start, reached, stride, gained = s2, np.full(len(drives), -np.inf), np.ones(len(drives)), np.zeros(len(drives))
+    best, most = (s2, share, psi), reached
     for k in range(settings.rounds):
         last = k == settings.rounds - 1
+        if last:  # from the best of the late rounds, where learning has lost its way since
+            lost = most > reached + _SLACK
+            s2 = np.where(lost[:, None], best[0], s2)
+            share, psi = (np.where(lost[rows.drive], *pair) for pair in zip(best[1:], (share, psi), strict=True))
         line = _linearised(rows, psi)
         out = _smoothed(rows, line, s2, share, settings, squares=not last and (learn or jumps), covariances=last)
         worth = out.loglik + _cost(rows, share, settings.tail) if jumps else out.loglik
         gained = np.where(np.isfinite(reached), worth - reached, 0.0)
         if last:
             break
+        if 2 * k >= settings.rounds:  # likelihoods from afar are those of another line
+            better = worth > most
+            most = np.where(better, worth, most)
+            mine = better[rows.drive]
+            best = (
+                np.where(better[:, None], s2, best[0]),
+                *(np.where(mine, new, old) for new, old in zip((share, psi), best[1:], strict=True)),
+            )
         # azimuths go on all the same: from afar their way to what fits may lead through what does not
         psi = np.where(np.isfinite(out.x[:, AZIMUTH]), out.x[:, AZIMUTH], psi)
         fell, reached = ~(worth > reached - _SLACK), worth
