@@ -40,6 +40,7 @@ constexpr double ep_wide = 1.15;  // by how much a stage reaches farther than th
 constexpr double ep_least = 3.0;   // effective points without which nothing is to be trusted
 constexpr double ep_some = 10.0;  // effective points without which the evidence itself is in doubt
 constexpr int ep_few = 2;     // rows that may come or go while the mode stays
+constexpr int ep_turns = 20;  // rounds over the parameters of a step that is held in a box
 constexpr int ep_never = 1 << 20; // of windows since a search: the next one searches
 constexpr double ep_sure = 0.25;  // standard deviations in which a step of Newton errs by no more than the mode may
 constexpr double ep_apart = 1.0;  // disagreement of moments, in standard deviations, beyond which no step is taken
@@ -382,12 +383,16 @@ struct EpLearner {
         return true;
     }
 
-    // Newton step over the parameters that are not held at a bound; returns its length in standard deviations
+    // Newton step: to the top of the quadratic of slope g and curvature H within the bounds and 0.8 of phi in each
+    // parameter; returns its length in standard deviations.
     double step(const double (*H)[ep_free], const double* phi, const double* g, double* d) const {
+        double from[ep_free], to[ep_free];
         int open[ep_free], k = 0;
         for (int j = 0; j < q; j++) {
             d[j] = 0.0;
-            const bool held = (phi[j] >= hi[j] - 1e-9 && g[j] > 0) || (phi[j] <= lo[j] + 1e-9 && g[j] < 0);
+            from[j] = max2(lo[j] - phi[j], -0.8);
+            to[j] = min2(hi[j] - phi[j], 0.8);
+            const bool held = (to[j] <= 1e-9 && g[j] > 0) || (from[j] >= -1e-9 && g[j] < 0);
             if (!held) open[k++] = j;
         }
         double M[ep_free * ep_free], L[ep_free * ep_free], p[ep_free], pi[ep_free], x[ep_free];
@@ -398,13 +403,21 @@ struct EpLearner {
         if (k == 0) return 0.0;
         ldl(Dim<0>(k), M, L, p, pi);
         ldl_solve(Dim<0>(k), Dim<1>(), L, pi, x);
+        bool within = true;
+        for (int i = 0; i < k; i++) within = within && x[i] >= from[open[i]] && x[i] <= to[open[i]];
+        // A step that is cut where it reaches too far may lead downhill, however short it is made: parameter by parameter
+        // from 0 it cannot.
+        for (int i = 0; i < k && !within; i++) x[i] = 0.0;
+        for (int sweep = 0; sweep < ep_turns && !within; sweep++)
+            for (int i = 0; i < k; i++) {
+                double rest = g[open[i]];
+                for (int j = 0; j < k; j++) rest -= j == i ? 0.0 : H[open[i]][open[j]] * x[j];
+                x[i] = min2(max2(rest / H[open[i]][open[i]], from[open[i]]), to[open[i]]);
+            }
         double far = 0.0;
         for (int i = 0; i < k; i++) {
-            const int j = open[i];
-            double to = phi[j] + min2(max2(x[i], -0.8), 0.8);
-            to = min2(max2(to, lo[j]), hi[j]);
-            d[j] = to - phi[j];
-            far = max2(far, std::fabs(d[j]) * std::sqrt(H[j][j]));
+            d[open[i]] = x[i];
+            far = max2(far, std::fabs(x[i]) * std::sqrt(H[open[i]][open[i]]));
         }
         return far;
     }
