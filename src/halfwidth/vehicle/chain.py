@@ -258,7 +258,8 @@ def _solved(
         if last:  # from the best of the late rounds, where learning has lost its way since
             lost = most > reached + _SLACK
             s2 = np.where(lost[:, None], best[0], s2)
-            share, psi = (np.where(lost[rows.drive], *pair) for pair in zip(best[1:], (share, psi), strict=True))
+            mine = lost[rows.drive]
+            share, psi = np.where(mine, best[1], share), np.where(mine, best[2], psi)
         line = _linearised(rows, psi)
         out = _smoothed(rows, line, s2, share, settings, squares=not last and (learn or jumps), covariances=last)
         worth = out.loglik + _cost(rows, share, settings.tail) if jumps else out.loglik
@@ -271,7 +272,8 @@ def _solved(
             mine = better[rows.drive]
             best = (
                 np.where(better[:, None], s2, best[0]),
-                *(np.where(mine, new, old) for new, old in zip((share, psi), best[1:], strict=True)),
+                np.where(mine, share, best[1]),
+                np.where(mine, psi, best[2]),
             )
         # azimuths go on all the same: from afar their way to what fits may lead through what does not
         psi = np.where(np.isfinite(out.x[:, AZIMUTH]), out.x[:, AZIMUTH], psi)
